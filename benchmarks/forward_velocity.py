@@ -1,0 +1,95 @@
+"""Does the learner learn? SAC on Ant's forward velocity, with the settings of a preset.
+
+A check that separates a broken learner from a hard reward: the same environment, networks, replay
+and update as in training, but paid for metres per second along x.
+"""
+
+import argparse
+import functools
+import json
+import sys
+import time
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks import common
+from maxent_jax import parts
+from maxent_jax.config import Config, preset
+from maxent_jax.envs import base
+from maxent_jax.sac import agent, losses, replay
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def init(config: Config, key: jax.Array):
+    p = parts.make(config)
+    key_agent, key_episodes = jax.random.split(key)
+    episodes = base.init(p.env, config.num_envs, config.num_starts, key_episodes)
+    state = jax.ShapeDtypeStruct((p.sac.observation_size,), jnp.float32)
+    action = jax.ShapeDtypeStruct((p.sac.action_size,), jnp.float32)
+    scalar = jax.ShapeDtypeStruct((), jnp.float32)
+    ring = replay.init(losses.Batch(state, action, scalar, state, scalar), config.replay_size)
+    return agent.init(p.sac, key_agent), episodes, ring
+
+
+def step(config: Config, carry, key: jax.Array):
+    """All envs once, then the gradient steps; also the mean forward velocity of the step."""
+    p = parts.make(config)
+    learner, episodes, ring = carry
+    key_act, key_env, key_sample, key_update = jax.random.split(key, 4)
+    action = agent.act(p.sac, learner.parameters.actor, episodes.env.obs, key_act)
+    episodes, t = base.step(p.env, episodes, action, config.episode_length, key_env)
+    velocity = (t.next_observation[:, 0] - t.observation[:, 0]) / p.env.dt
+    alive = 1.0 - t.terminated.astype(jnp.float32)
+    ring = replay.add(
+        ring, losses.Batch(t.observation, t.action, velocity, t.next_observation, alive), t.valid
+    )
+    shape = (config.updates_per_vector_step, config.batch_size)
+    batches = replay.sample(ring, shape, key_sample)
+    learner, _ = jax.lax.scan(
+        lambda a, x: agent.update(p.sac, a, *x),
+        learner,
+        (batches, jax.random.split(key_update, shape[0])),
+    )
+    return (learner, episodes, ring), jnp.mean(velocity)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 3), donate_argnums=1)
+def steps(config: Config, carry, key: jax.Array, num: int):
+    return jax.lax.scan(functools.partial(step, config), carry, jax.random.split(key, num))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--preset", default="quick")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=180.0, help="of training, compiled")
+    args = parser.parse_args()
+    config = preset(args.preset, random_baseline=False)
+    common.print_versions()
+    key, key_init = jax.random.split(jax.random.key(args.seed))
+    carry = init(config, key_init)
+    vector_steps = config.vector_steps
+    compiled = steps.lower(config, carry, key, vector_steps).compile()
+    started, done = time.perf_counter(), 0
+    velocity = float("nan")
+    while time.perf_counter() - started < args.seconds:
+        key, key_steps = jax.random.split(key)
+        carry, velocities = compiled(carry, key_steps)
+        velocity = float(jnp.mean(velocities))
+        done += vector_steps
+        seconds = time.perf_counter() - started
+        print(f"{seconds:5.0f} s  {velocity:6.2f} m/s", file=sys.stderr)
+    row = {
+        "benchmark": "forward_velocity",
+        "seed": args.seed,
+        "env_steps": done * config.num_envs,
+        "gradient_steps": done * config.updates_per_vector_step,
+        "mean_velocity_last_segment": round(velocity, 3),
+        "wall_seconds": round(time.perf_counter() - started, 1),
+    }
+    print(json.dumps(row))
+
+
+if __name__ == "__main__":
+    main()

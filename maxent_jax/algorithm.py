@@ -1,0 +1,203 @@
+"""Algorithm 1, for every method: pure functions from state to state.
+
+    begin          roll the mixture out, define r_t from it, choose the agent to start from
+    train_segment  a fixed number of env steps with their updates
+    end            archive the agent, evaluate the mixture
+
+`iterate` composes them and `run` scans `iterate` as one program; a driver that logs and saves in
+between calls the same three. A method is data in the state, so all methods share one program.
+"""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from maxent_jax import methods, mixture, occupancy, parts, training
+from maxent_jax.config import Config
+from maxent_jax.density import entropy, histogram, reservoir
+from maxent_jax.envs import base
+from maxent_jax.mixture import Archive
+from maxent_jax.occupancy import Occupancy
+from maxent_jax.parts import Parts
+from maxent_jax.sac import agent
+from maxent_jax.sac.agent import Agent
+from maxent_jax.training import Learner, Reference
+from maxent_jax.types import Metrics
+
+EVALUATION_SEED = 0  # rollouts that measure the mixture use the same randomness every time
+
+
+class State(NamedTuple):
+    """All that the next step needs."""
+
+    key: jax.Array  # typed
+    iteration: jax.Array  # [] int32, iterations completed
+    method: methods.Method
+    archive: Archive
+    learner: Learner
+
+
+# With seeds side by side every leaf has a leading axis [S, ...], but for the method, which they
+# share: jax.vmap(f, SEED_AXES, SEED_AXES) for f: State -> State.
+SEED_AXES = State(key=0, iteration=0, method=None, archive=0, learner=0)  # type: ignore[arg-type]
+
+
+def init(config: Config, key: jax.Array) -> State:
+    """Before the first iteration: π_0, untrained, is the whole mixture."""
+    return _init(config.program(), methods.make(config), key)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _init(config: Config, method: methods.Method, key: jax.Array) -> State:
+    key, key_learner = jax.random.split(key)
+    learner = training.init(parts.make(config), key_learner)
+    initial = learner.agent.parameters
+    archive = mixture.append(mixture.init(initial, config.archive_size), initial)
+    return State(key, jnp.zeros((), jnp.int32), method, archive, learner)
+
+
+def begin(config: Config, state: State) -> tuple[State, Metrics]:
+    """Steps 1 to 3 of Algorithm 1, and the start of step 4."""
+    p = parts.make(config)
+    learner, archive, method = state.learner, state.archive, state.method
+    key, *keys = jax.random.split(state.key, 6)
+    key_starts, key_rollout, key_rows, key_history, key_scratch = keys
+
+    weights = method.weights[archive.size - 1]
+    starts = base.draw_starts(learner.episodes.starts, config.mixture_episodes, key_starts)
+    visited = occupancy.of_mixture(p, archive, weights, starts, key_rollout)
+
+    # Before there is a history, the first rollouts stand in for one.
+    unseen = (learner.history.seen == 0) & (visited.weight > 0)
+    history = reservoir.add(learner.history, visited.features, unseen, key_history)
+    rows = mixture.draw_rows(visited.weight, config.reference_size, key_rows)
+    rows = jnp.where(method.from_history, -1, rows)
+    reference = Reference(
+        jnp.where(method.from_history, history.points, visited.features[rows]),
+        jnp.where(method.from_history, reservoir.count(history), config.reference_size),
+    )
+    scores = occupancy.score(p, visited, reference.points, rows, archive)
+    best = occupancy.best(scores, visited)
+    learner = learner._replace(
+        agent=_start(p, method, archive, learner.agent, best, key_scratch),
+        replay=learner.replay._replace(
+            items=training.measure(p, reference, learner.replay.items)
+        ),
+        reference=reference,
+        history=history,
+    )
+    metrics = {
+        "weights": weights,
+        "effective_policies": jnp.exp(-jnp.sum(weights * jnp.log(jnp.maximum(weights, 1e-38)))),
+        "best_policy": best,
+        "policy_return": scores.episode_return,
+        "policy_step_reward": scores.step_reward,
+        "num_rollout_steps": jnp.sum(visited.weight > 0, dtype=jnp.int32),
+        "num_rollout_invalid": visited.num_invalid,
+    }
+    return state._replace(key=key, learner=learner), metrics
+
+
+def train_segment(config: Config, state: State) -> tuple[State, Metrics]:
+    """`config.vector_steps` steps of all envs with their gradient steps (step 4)."""
+    p = parts.make(config)
+
+    def step(learner, key):
+        return training.step(p, state.method, learner, key)
+
+    key, key_steps = jax.random.split(state.key)
+    keys = jax.random.split(key_steps, config.vector_steps)
+    learner, metrics = jax.lax.scan(step, state.learner, keys)
+    return state._replace(key=key, learner=learner), reduce_metrics(metrics)
+
+
+def end(config: Config, state: State) -> tuple[State, Metrics]:
+    """Archives the agent, and measures what has been reached."""
+    p = parts.make(config)
+    learner = state.learner
+    archive = mixture.append(state.archive, learner.agent.parameters)
+    weights = state.method.weights[archive.size - 1]
+    key_starts, key_rollout, key_rows = jax.random.split(jax.random.key(EVALUATION_SEED), 3)
+    starts = base.draw_starts(learner.episodes.starts, config.mixture_episodes, key_starts)
+    visited = occupancy.of_mixture(p, archive, weights, starts, key_rollout)
+    state = state._replace(iteration=state.iteration + 1, archive=archive)
+    metrics = {
+        "iteration": state.iteration,
+        "env_steps": learner.env_steps,
+        "gradient_steps": learner.gradient_steps,
+        **_coverage("cumulative", learner.visits),
+        **(_coverage("random", learner.random_visits) if config.random_baseline else {}),
+        **_mixture_metrics(p, visited, key_rows),
+    }
+    return state, metrics
+
+
+def iterate(config: Config, state: State) -> tuple[State, Metrics]:
+    """One iteration of Algorithm 1."""
+    state, at_begin = begin(config, state)
+    state, in_segments = jax.lax.scan(
+        lambda s, _: train_segment(config, s), state, length=config.num_segments
+    )
+    state, at_end = end(config, state)
+    return state, at_begin | reduce_metrics(in_segments) | at_end
+
+
+def run(config: Config, state: State, num_iterations: int) -> tuple[State, Metrics]:
+    """That many iterations as one program; metrics [T, ...]. Jit it with the state donated."""
+    return jax.lax.scan(lambda s, _: iterate(config, s), state, length=num_iterations)
+
+
+def reduce_metrics(metrics: Metrics) -> Metrics:
+    """Over the leading axis: counts, named num_, are summed; the rest is averaged."""
+    return {
+        name: jnp.sum(value, 0) if name.startswith("num_") else jnp.mean(value, 0)
+        for name, value in metrics.items()
+    }
+
+
+def _start(
+    p: Parts,
+    method: methods.Method,
+    archive: Archive,
+    last: Agent,
+    best: jax.Array,
+    key: jax.Array,
+) -> Agent:
+    """The agent that the iteration starts from, as methods.STARTS says."""
+    scratch = agent.init(p.sac, key)
+    restored = agent.restart(p.sac, mixture.policy(archive, best))
+    candidates = dict(scratch=scratch, last=last, best=restored)
+    stacked = jax.tree.map(
+        lambda *x: jnp.stack(x), *(candidates[name] for name in methods.STARTS)
+    )
+    chosen = jax.tree.map(lambda x: x[method.start], stacked)
+    if not p.config.restart_temperature:
+        return chosen
+    initial = scratch.parameters.log_temperature
+    return chosen._replace(parameters=chosen.parameters._replace(log_temperature=initial))
+
+
+def _coverage(of: str, visits: training.Visits) -> Metrics:
+    on_grid = jnp.sum(visits.cells)
+    return {
+        f"{of}_coverage": histogram.coverage(visits.cells),
+        f"{of}_entropy": histogram.shannon_entropy(visits.cells),
+        f"{of}_off_grid_share": visits.off_grid / jnp.maximum(on_grid + visits.off_grid, 1),
+    }
+
+
+def _mixture_metrics(p: Parts, visited: Occupancy, key: jax.Array) -> Metrics:
+    config, grid = p.config, p.env.task.grid
+    cells = histogram.count(visited.states, grid, visited.weight)
+    rows = mixture.draw_rows(visited.weight, config.reference_size, key)
+    sample = visited.features[rows]
+    lived = jnp.sum(visited.weight > 0) / config.mixture_episodes
+    return {
+        "mixture_coverage": histogram.coverage(cells),
+        "mixture_entropy": histogram.shannon_entropy(cells),
+        "mixture_off_grid_share": 1 - jnp.sum(cells),
+        "mixture_knn_entropy": entropy.knn_entropy(sample, config.num_neighbors, labels=rows),
+        "mixture_episode_length": lived,
+    }

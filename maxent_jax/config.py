@@ -1,0 +1,337 @@
+"""Every setting of a run, its presets, and the checks of its values. Loads no array library."""
+
+import dataclasses
+import difflib
+from typing import Any
+
+ENVS = ("ant",)
+METHODS = ("h", "la", "v")
+BACKENDS = ("auto", "mjx", "mujoco", "warp")
+PHYSICS = ("reference", "fast")
+REWARDS = ("log1p", "linear", "log", "paper")
+INPUTS = ("state", "heading")
+WEIGHTS = ("method", "uniform", "geometric")
+REFERENCES = ("method", "mixture", "history")
+STARTS = ("method", "scratch", "last", "best")
+BY_METHOD = -1
+
+
+class ConfigError(ValueError):
+    """A setting that no run can have; the message says which, and what to do."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Settings of a run; frozen and hashable, changed with `dataclasses.replace`."""
+
+    env: str = "ant"
+    """Environment."""
+    method: str = "v"
+    """h (Hazan 2019), la (Liu & Abbeel 2021) or v (Veritas)."""
+    preset: str = "quick"
+    """The values that the other flags start from: smoke, quick or paper."""
+    backend: str = "auto"
+    """Physics: mjx, mujoco (C MuJoCo), or auto, which is mujoco on a CPU."""
+    physics: str = "reference"
+    """reference (the options of Gymnasium's XML) or fast (fewer solver iterations)."""
+    seed: int = 0
+    """Of everything random but the feature projection."""
+    num_seeds: int = 1
+    """Runs trained side by side by vmap: seed, seed + 1, ..."""
+
+    num_iterations: int = 6
+    """T: policies trained after the initial one."""
+    steps_per_iteration: int = 60_000
+    """Env steps of training in an iteration, all envs together."""
+    updates_per_step: float = 0.5
+    """Gradient steps per env step."""
+    num_envs: int = 32
+    """N: environments stepped together."""
+    num_segments: int = 15
+    """Parts of an iteration; progress is shown after each."""
+
+    episode_length: int = 1000
+    """Time limit, control steps."""
+    num_starts: int = 4096
+    """Pool of random starts."""
+    torque_limit: float = 1.0
+    """Share of the control range that the agent may use; below 1 departs from the paper."""
+    end_flipped: bool = False
+    """End an episode upside down; departs from the paper."""
+    policy_inputs: str = "state"
+    """What the networks see: state, or heading (the same in the agent's own horizontal frame)."""
+    yaw_copies: int = 0
+    """Copies of each transition, turned by a random yaw, that enter the replay beside it."""
+
+    reward: str = "log1p"
+    """log1p: log(1 + R/c); linear: R/c; log: log(R/c); paper: p log R."""
+    reward_distance: float = 5.0
+    """c, in feature units (metres for the first two features)."""
+    reward_scale: float = 1.0
+    """Factor on the whole reward that SAC sees."""
+    shaping: float = 0.0
+    """Potential-based shaping: the potential, as a multiple of the reward's form. 0: none."""
+    shaping_survives_death: bool = False
+    """A state in which health fails keeps its potential: faster, and not policy-invariant."""
+    episodic_weight: float = 0.0
+    """λ of the episodic term. 0: none."""
+
+    num_neighbors: int = 3
+    """k."""
+    reference_size: int = 8192
+    """M: states that define the reward."""
+    mixture_episodes: int = 32
+    """Episodes rolled out with the mixture for each refresh, and again for each evaluation."""
+    pooled: bool = False
+    """Draw the reference from the pooled states of the mixture, so that long-lived policies weigh
+    more, instead of giving each policy its weight."""
+    leave_own_out: bool = True
+    """Score an archived policy without its own states in the reference."""
+    weights: str = "method"
+    """Of the mixture: uniform, geometric, or as the method says."""
+    eta: float = 0.1
+    """η of the geometric weights."""
+    reference: str = "method"
+    """What the reward is measured against: mixture (its rollouts), history (a uniform sample of
+    all states visited in training), or as the method says."""
+    refresh_period: int = BY_METHOD
+    """Steps of all envs between refreshes of the reward; 0: once an iteration; -1: as the method
+    says. A mixture changes once an iteration, so that any period above 0 matters to history."""
+    start: str = "method"
+    """The agent that an iteration starts from: scratch, last, best, or as the method says."""
+
+    hidden_layers: int = 2
+    """Hidden layers of actor and critics."""
+    hidden_size: int = 256
+    """Units in each."""
+    critic_layer_norm: bool = False
+    """Layer norm in the critics; departs from the paper."""
+    learning_rate: float = 3e-4
+    """Adam, for actor, critics and temperature."""
+    batch_size: int = 128
+    """Transitions in a gradient step."""
+    replay_size: int = 1_000_000
+    """Transitions kept."""
+    discount: float = 0.99
+    """γ."""
+    soft_update_rate: float = 0.005
+    """Of the target critics."""
+    initial_temperature: float = 0.2
+    """α at the start."""
+    target_entropy_scale: float = 1.0
+    """Target entropy is minus this many nats per action dimension."""
+    restart_temperature: bool = False
+    """Put α back to its initial value at the start of each iteration."""
+
+    random_baseline: bool = True
+    """Step a uniformly random policy beside the agent, for as many env steps, and log it."""
+
+    def __post_init__(self):
+        _check(self)
+
+    @property
+    def vector_steps(self) -> int:
+        """Steps of all envs in a segment."""
+        return self.steps_per_iteration // (self.num_envs * self.num_segments)
+
+    @property
+    def updates_per_vector_step(self) -> int:
+        """Gradient steps after each step of all envs."""
+        return round(self.updates_per_step * self.num_envs)
+
+    @property
+    def archive_size(self) -> int:
+        """P: the initial policy and one an iteration."""
+        return self.num_iterations + 1
+
+    def program(self) -> "Config":
+        """This config with all that is data, not program, at its default.
+
+        Configs with equal programs share one compilation; the data enters the state in
+        `algorithm.init`.
+        """
+        return dataclasses.replace(
+            self,
+            **{name: _DEFAULTS[name] for name in DATA_FIELDS},
+        )
+
+    def deviations(self) -> dict[str, str]:
+        """What this config does otherwise than the paper, by field."""
+        return {
+            name: why for name, (departs, why) in _DEVIATIONS.items() if departs(getattr(self, name))
+        }
+
+
+DATA_FIELDS = (
+    *("method", "preset", "seed", "num_seeds"),
+    *("weights", "eta", "reference", "refresh_period", "start"),
+)
+_DEFAULTS = {field.name: field.default for field in dataclasses.fields(Config)}
+
+_DEVIATIONS: dict[str, tuple[Any, str]] = {
+    "physics": (lambda x: x != "reference", "the constraint solver stops early"),
+    "torque_limit": (lambda x: x < 1, "torques are limited to a share of the control range"),
+    "end_flipped": (lambda x: x, "an episode also ends upside down"),
+    "policy_inputs": (lambda x: x != "state", "networks see the state in the heading's frame"),
+    "yaw_copies": (lambda x: x > 0, "transitions turned by a random yaw enter the replay too"),
+    "reward": (lambda x: x != "paper", "the reward's form is not p log R"),
+    "reward_scale": (lambda x: x != 1, "the reward is scaled"),
+    "shaping": (lambda x: x != 0, "the reward is shaped by a potential"),
+    "shaping_survives_death": (lambda x: x, "the potential survives death: not policy-invariant"),
+    "episodic_weight": (lambda x: x == 0, "no episodic term"),
+    "leave_own_out": (lambda x: x, "policies are scored without their own states"),
+    "hidden_size": (lambda x: x != 256, "hidden layers are not 256 wide"),
+    "critic_layer_norm": (lambda x: x, "critics have layer norm"),
+    "learning_rate": (lambda x: x != 3e-4, "Adam's rate is not 3e-4"),
+    "initial_temperature": (lambda x: x != 0.2, "the temperature starts elsewhere than at 0.2"),
+    "restart_temperature": (lambda x: x, "the temperature restarts in each iteration"),
+    "replay_size": (lambda x: x != 1_000_000, "the replay does not hold 1e6 transitions"),
+}
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "smoke": dict(
+        num_iterations=2,
+        steps_per_iteration=400,
+        updates_per_step=0.25,
+        num_envs=4,
+        num_segments=2,
+        episode_length=100,
+        num_starts=64,
+        reference_size=256,
+        mixture_episodes=8,
+        hidden_size=32,
+        batch_size=32,
+        replay_size=2_000,
+    ),
+    "quick": dict(
+        torque_limit=0.4,
+        end_flipped=True,
+        policy_inputs="heading",
+        yaw_copies=1,
+        shaping=10.0,
+        shaping_survives_death=True,
+        hidden_size=128,
+        critic_layer_norm=True,
+        learning_rate=1e-3,
+        initial_temperature=0.1,
+        restart_temperature=True,
+        replay_size=240_000,
+    ),
+    "paper": dict(
+        num_iterations=20,
+        steps_per_iteration=150_000,
+        updates_per_step=1.0,
+        num_envs=16,
+        num_segments=25,
+        reward="paper",
+        episodic_weight=0.1,
+        leave_own_out=False,
+        reference_size=16_384,
+        mixture_episodes=64,
+    ),
+}
+
+
+def preset(name: str, **changes: Any) -> Config:
+    """The config of that preset, with changes.
+
+    Raises:
+      ConfigError: an unknown preset, or a value that no run can have.
+    """
+    if name not in PRESETS:
+        raise ConfigError(_unknown("preset", name, PRESETS))
+    return Config(**{"preset": name, **PRESETS[name], **changes})
+
+
+def _unknown(what: str, value: str, known: Any) -> str:
+    nearest = difflib.get_close_matches(value, known, n=1, cutoff=0.4)
+    hint = f"did you mean '{nearest[0]}'?" if nearest else f"choose one of {', '.join(known)}."
+    return f"unknown {what} '{value}': {hint}"
+
+
+_CHOICES = {
+    "env": ENVS,
+    "method": METHODS,
+    "preset": PRESETS,
+    "backend": BACKENDS,
+    "physics": PHYSICS,
+    "reward": REWARDS,
+    "policy_inputs": INPUTS,
+    "weights": WEIGHTS,
+    "reference": REFERENCES,
+    "start": STARTS,
+}
+_AT_LEAST_ONE = (
+    *("num_seeds", "num_iterations", "steps_per_iteration", "num_envs", "num_segments"),
+    *("episode_length", "num_starts", "num_neighbors", "reference_size", "mixture_episodes"),
+    *("hidden_layers", "hidden_size", "batch_size", "replay_size"),
+)
+_POSITIVE = (
+    *("updates_per_step", "torque_limit", "reward_distance", "reward_scale", "learning_rate"),
+    *("soft_update_rate", "initial_temperature", "eta"),
+)
+_AT_MOST_ONE = ("torque_limit", "discount", "soft_update_rate", "eta")
+_NOT_NEGATIVE = (
+    *("seed", "shaping", "episodic_weight", "yaw_copies", "discount", "target_entropy_scale"),
+)
+
+
+def _check(config: Config) -> None:
+    for name, known in _CHOICES.items():
+        if getattr(config, name) not in known:
+            raise ConfigError(_unknown(name.replace("_", "-"), getattr(config, name), known))
+    bounds = (
+        (_AT_LEAST_ONE, lambda x: x >= 1, "at least 1"),
+        (_POSITIVE, lambda x: 0 < x < float("inf"), "a positive number"),
+        (_AT_MOST_ONE, lambda x: x <= 1, "at most 1"),
+        (_NOT_NEGATIVE, lambda x: 0 <= x < float("inf"), "0 or more"),
+        (("refresh_period",), lambda x: x >= BY_METHOD, "-1, 0 or more"),
+    )
+    for names, holds, requirement in bounds:
+        for name in names:
+            if not holds(getattr(config, name)):
+                flag = name.replace("_", "-")
+                raise ConfigError(f"{flag} is {getattr(config, name)}, but must be {requirement}.")
+    _check_together(config)
+
+
+def _check_together(c: Config) -> None:
+    group = c.num_envs * c.num_segments
+    updates = c.updates_per_step * c.num_envs
+    for wrong, sentence in (
+        (
+            c.steps_per_iteration % group,
+            f"steps-per-iteration is {c.steps_per_iteration}, but must be a multiple of "
+            f"num-envs × num-segments = {group}.",
+        ),
+        (
+            updates < 1 or updates != round(updates),
+            f"updates-per-step × num-envs is {updates:g}, but must be a whole number of at least 1.",
+        ),
+        (
+            c.num_neighbors >= c.reference_size,
+            f"num-neighbors is {c.num_neighbors}, but must be below reference-size = "
+            f"{c.reference_size}.",
+        ),
+        (
+            c.batch_size > c.replay_size,
+            f"batch-size is {c.batch_size}, but must not exceed replay-size = {c.replay_size}.",
+        ),
+        (
+            c.num_envs * (1 + c.yaw_copies) > c.replay_size,
+            f"replay-size is {c.replay_size}, but one step of all envs and their yaw copies adds "
+            f"{c.num_envs * (1 + c.yaw_copies)}.",
+        ),
+        (
+            c.mixture_episodes < c.archive_size,
+            f"mixture-episodes is {c.mixture_episodes}, but each of the {c.archive_size} policies "
+            f"of the mixture needs one.",
+        ),
+        (
+            c.reference_size > c.mixture_episodes * c.episode_length,
+            f"reference-size is {c.reference_size}, but mixture-episodes × episode-length gives at "
+            f"most {c.mixture_episodes * c.episode_length} states.",
+        ),
+    ):
+        if wrong:
+            raise ConfigError(sentence)

@@ -1,0 +1,1 @@
+"""How densely states lie: exact nearest neighbours, entropy estimates, histograms."""

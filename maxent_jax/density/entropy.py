@@ -1,0 +1,58 @@
+"""The k-nearest-neighbour density and entropy (Eq. 6 and 9). In nats."""
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import digamma, gammaln
+
+from maxent_jax.density.knn import knn_distances
+
+
+def log_density(distance: jax.Array, num_points: jax.Array | int, k: int, dims: int) -> jax.Array:
+    """log of k Γ(p/2 + 1) / (N π^(p/2) R^p): k points in the ball of radius R.
+
+    Args:
+      distance: [...] R, to the k-th nearest of the points.
+      num_points: N, the points that could have been neighbours.
+      k: which neighbour R leads to.
+      dims: p.
+    Returns:
+      [...] nats; inf where R is 0.
+    Source: Eq. 9.
+    """
+    log_volume = 0.5 * dims * jnp.log(jnp.pi) - gammaln(0.5 * dims + 1) + dims * jnp.log(distance)
+    return jnp.log(k) - jnp.log(num_points) - log_volume
+
+
+def knn_density(
+    queries: jax.Array, points: jax.Array, k: int, exclude: jax.Array | None = None
+) -> jax.Array:
+    """The density at each query, [B, F] -> [B], per unit of volume. Arguments: knn_distances.
+
+    Source: Eq. 9. A query that names a point to exclude has one neighbour fewer to find.
+    """
+    num_points = jnp.asarray(points.shape[0], jnp.float32)
+    if exclude is not None:
+        num_points = num_points - (exclude >= 0)
+    distance = knn_distances(queries, points, k, exclude)[:, -1]
+    return jnp.exp(log_density(distance, num_points, k, points.shape[1]))
+
+
+def knn_entropy(samples: jax.Array, k: int, labels: jax.Array | None = None) -> jax.Array:
+    """Differential entropy of the distribution that the samples come from.
+
+    Args:
+      samples: [N, F], measured against themselves, so that each has N - 1 others.
+      k: which neighbour.
+      labels: [N] int, equal for samples that are one and the same, drawn more than once.
+    Returns:
+      [] nats; -inf where k or more samples coincide with another one.
+    Raises:
+      ValueError: N <= k.
+    Source: Eq. 6, with its bias correction log k - ψ(k) (Kozachenko & Leonenko 1987).
+    """
+    num_samples, dims = samples.shape
+    if num_samples <= k:
+        raise ValueError(f"{num_samples} samples are too few for {k} neighbours")
+    labels = jnp.arange(num_samples, dtype=jnp.int32) if labels is None else labels
+    distance = knn_distances(samples, samples, k, exclude=labels, labels=labels)[:, -1]
+    return jnp.mean(-log_density(distance, num_samples - 1, k, dims)) + jnp.log(k) - digamma(k)

@@ -1,0 +1,49 @@
+"""Visits to the cells of a grid: the coverage and entropy that the paper reports."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+
+class Grid(NamedTuple):
+    """Cells of equal size over two coordinates of the state. Static and hashable."""
+
+    coordinates: tuple[int, int]  # of the state
+    low: tuple[float, float]  # metres
+    high: tuple[float, float]  # metres
+    bins: tuple[int, int]
+
+
+def count(states: jax.Array, grid: Grid, weights: jax.Array | None = None) -> jax.Array:
+    """How often, or with how much weight, the states visit each cell.
+
+    Args:
+      states: [B, D].
+      grid: the cells; a state on the upper edge belongs to the last cell, as in numpy.
+      weights: [B] int or float, what each state counts; 1 when left out.
+    Returns:
+      [bins, bins] in the weights' dtype, else int32. States off the grid, and NaN, are dropped.
+    """
+    weights = jnp.ones(states.shape[0], jnp.int32) if weights is None else weights
+    position = states[:, jnp.array(grid.coordinates)]
+    low, high, bins = (jnp.array(x, jnp.float32) for x in (grid.low, grid.high, grid.bins))
+    cell = jnp.floor((position - low) / (high - low) * bins)
+    cell = jnp.where(position == high, bins - 1, cell)
+    inside = ((position >= low) & (position <= high)).all(-1)
+    row, column = jnp.where(inside[:, None], cell, 0).astype(jnp.int32).T
+    num_cells = grid.bins[0] * grid.bins[1]
+    flat = jnp.where(inside, row * grid.bins[1] + column, num_cells)
+    counts = jnp.zeros(num_cells, weights.dtype).at[flat].add(weights, mode="drop")
+    return counts.reshape(grid.bins)
+
+
+def coverage(counts: jax.Array) -> jax.Array:
+    """[] int32: cells visited at least once."""
+    return jnp.sum(counts > 0, dtype=jnp.int32)
+
+
+def shannon_entropy(counts: jax.Array) -> jax.Array:
+    """[] nats: entropy of the cells' visit frequencies, at most log(number of cells); 0 if none."""
+    frequency = counts / jnp.maximum(jnp.sum(counts), 1)
+    return -jnp.sum(jnp.where(counts > 0, frequency * jnp.log(jnp.maximum(frequency, 1e-38)), 0.0))

@@ -1,0 +1,119 @@
+"""The mixture: an archive of policies as one pytree, their weights, and drawing from it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from maxent_jax.sac.agent import Parameters
+
+
+class Archive(NamedTuple):
+    """The first `size` of P slots hold a policy; the others are masked by weight 0."""
+
+    parameters: Parameters  # [P, ...]
+    size: jax.Array  # int32
+
+
+def init(parameters: Parameters, capacity: int) -> Archive:
+    """An empty archive for agents of that shape."""
+    empty = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), parameters)
+    return Archive(empty, jnp.zeros((), jnp.int32))
+
+
+def append(archive: Archive, parameters: Parameters) -> Archive:
+    """With one more policy. Beyond the last slot nothing is stored."""
+    stored = jax.tree.map(
+        lambda slots, x: slots.at[archive.size].set(x, mode="drop"), archive.parameters, parameters
+    )
+    return Archive(stored, archive.size + 1)
+
+
+def policy(archive: Archive, index: jax.Array) -> Parameters:
+    """The agent in the slots `index` [...], with those axes in front of each leaf."""
+    return jax.tree.map(lambda slots: slots[index], archive.parameters)
+
+
+def uniform_weights(n: int) -> np.ndarray:
+    """[n] float64: 1/n each (MaxEnt-V and LA)."""
+    _check_count(n)
+    return np.full(n, 1.0 / n)
+
+
+def geometric_weights(n: int, eta: float) -> np.ndarray:
+    """The η-geometric weights of MaxEnt-H, oldest policy first, newest largest.
+
+    y_i = (1 - η)^(n - i) for i = 0 ... n - 1, projected on the simplex in the Euclidean norm.
+
+    Args:
+      n: policies.
+      eta: step size in (0, 1].
+    Returns:
+      [n] float64, at least 0, of sum 1.
+    Raises:
+      ValueError: n < 1, or η outside (0, 1].
+    Source: Eq. 13, as in the official code of Hazan et al. 2019; see README, decision 3.
+    """
+    _check_count(n)
+    if not 0 < eta <= 1:
+        raise ValueError(f"eta is {eta}, but must be in (0, 1]")
+    return project_to_simplex((1 - eta) ** (n - np.arange(n, dtype=np.float64)))
+
+
+def project_to_simplex(values: np.ndarray) -> np.ndarray:
+    """The nearest point [n] with entries at least 0 of sum 1, in closed form.
+
+    Source: Duchi et al. 2008, Fig. 1.
+    """
+    descending = np.sort(values)[::-1]
+    excess = (np.cumsum(descending) - 1) / np.arange(1, len(values) + 1)
+    threshold = excess[np.flatnonzero(descending > excess)[-1]]
+    return np.maximum(values - threshold, 0)
+
+
+def weight_table(kind: str, capacity: int, eta: float) -> np.ndarray:
+    """[P, P] float32: row n - 1 weighs the first n policies, zero beyond.
+
+    Made once on the host in float64, so that no projection of dynamic size enters the scan.
+    """
+    table = np.zeros((capacity, capacity))
+    for n in range(1, capacity + 1):
+        table[n - 1, :n] = geometric_weights(n, eta) if kind == "geometric" else uniform_weights(n)
+    return table.astype(np.float32)
+
+
+def assign_episodes(weights: jax.Array, num_episodes: int, offset: jax.Array) -> jax.Array:
+    """Which policy plays each episode, by systematic sampling: shares off by less than one episode.
+
+    Args:
+      weights: [P] of sum 1.
+      num_episodes: E.
+      offset: [] in [0, 1): 0.5 gives equal weights equal shares; random makes the draw unbiased.
+    Returns:
+      [E] int32, ascending.
+    """
+    ticks = (jnp.arange(num_episodes) + offset) / num_episodes
+    return _inverse_cumulative(weights, ticks)
+
+
+def draw_rows(weights: jax.Array, num: int, key: jax.Array) -> jax.Array:
+    """[num] int32: rows drawn in proportion to `weights` [R] >= 0, by systematic sampling.
+
+    A row repeats only where its share of the draw exceeds one.
+    """
+    ticks = (jnp.arange(num) + jax.random.uniform(key)) / num
+    return _inverse_cumulative(weights, ticks)
+
+
+def _inverse_cumulative(weights: jax.Array, ticks: jax.Array) -> jax.Array:
+    cumulative = jnp.cumsum(weights)
+    row = jnp.searchsorted(cumulative, ticks * cumulative[-1], side="right")
+    # Rounding may push the last tick past the end; the last row with weight takes it.
+    last = weights.shape[0] - 1 - jnp.argmax(weights[::-1] > 0)
+    return jnp.minimum(row, last).astype(jnp.int32)
+
+
+def _check_count(n: int) -> None:
+    if n < 1:
+        raise ValueError(f"a mixture needs at least 1 policy, not {n}")

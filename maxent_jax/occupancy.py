@@ -1,0 +1,120 @@
+"""The states that a mixture visits: rolled out, weighted, sampled, and scored by policy."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import State
+
+from maxent_jax import mixture, rewards, rollout
+from maxent_jax.density.knn import NONE_EXCLUDED, knn_distances
+from maxent_jax.mixture import Archive
+from maxent_jax.parts import Parts
+from maxent_jax.sac import agent
+
+
+class Occupancy(NamedTuple):
+    """R = T·E states of E episodes, with their share of the mixture's occupancy."""
+
+    states: jax.Array  # [R, D]
+    features: jax.Array  # [R, F]
+    policy: jax.Array  # [R] int32, who reached it
+    weight: jax.Array  # [R], sums to 1; 0 after an episode's end
+    episode_policy: jax.Array  # [E] int32
+    num_invalid: jax.Array  # [] int32
+
+
+class Scores(NamedTuple):
+    """How each archived policy does under r_t, unshaped; 0 for an empty slot."""
+
+    episode_return: jax.Array  # [P] undiscounted, mean over its episodes
+    step_reward: jax.Array  # [P] mean over its states
+
+
+def of_mixture(
+    parts: Parts, archive: Archive, weights: jax.Array, starts: State, key: jax.Array
+) -> Occupancy:
+    """Rolls the mixture out, one policy for each episode.
+
+    Unless the config pools, every policy plays the same number of episodes and its states share
+    its weight: episodes end early when health fails, and a pooled sample would weigh policies by
+    how long they live. Pooled, policies are drawn by weight and all states count alike.
+
+    Args:
+      weights: [P].
+      starts: [E, ...].
+    """
+    config = parts.config
+    key_assign, key_act = jax.random.split(key)
+    slots = jnp.arange(weights.shape[0])
+    if config.pooled:
+        plays, offset = weights, jax.random.uniform(key_assign)
+    else:
+        plays = (slots < archive.size) / archive.size
+        offset = jnp.asarray(0.5)
+    episode_policy = mixture.assign_episodes(plays, config.mixture_episodes, offset)
+    actors = mixture.policy(archive, episode_policy).actor
+
+    def act(observation, key_step):
+        keys = jax.random.split(key_step, config.mixture_episodes)
+        one = lambda actor, s, k: agent.act(parts.sac, actor, s, k)
+        return jax.vmap(one)(actors, observation, keys)
+
+    reached = rollout.episodes(parts.env, starts, act, config.episode_length, key_act)
+    states = reached.states.reshape(-1, reached.states.shape[-1])
+    policy = jnp.broadcast_to(episode_policy, reached.alive.shape).reshape(-1)
+    alive = reached.alive.reshape(-1).astype(jnp.float32)
+    if config.pooled:
+        weight = alive
+    else:
+        lived = jnp.zeros(weights.shape[0]).at[policy].add(alive)
+        weight = alive * (weights / jnp.maximum(lived, 1))[policy]
+    return Occupancy(
+        states=states,
+        features=parts.phi(states),
+        policy=policy,
+        weight=weight / jnp.sum(weight),
+        episode_policy=episode_policy,
+        num_invalid=reached.num_invalid,
+    )
+
+
+def score(
+    parts: Parts, occupancy: Occupancy, points: jax.Array, rows: jax.Array, archive: Archive
+) -> Scores:
+    """Each policy's return under the reward that the reference points define.
+
+    Args:
+      points: [M, F] the reference.
+      rows: [M] int32, which row of the occupancy each point is; -1 for none. A state does not see
+        itself, nor, with leave_own_out, any state of its own policy.
+    """
+    config = parts.config
+    num_rows = occupancy.policy.shape[0]
+    itself = jnp.arange(num_rows, dtype=jnp.int32)
+    label, point_label = itself, rows
+    if config.leave_own_out:
+        # A mixture of one policy would be left with nothing.
+        alone = archive.size == 1
+        label = jnp.where(alone, itself, occupancy.policy)
+        point_label = jnp.where(alone | (rows < 0), rows, occupancy.policy[rows])
+    point_label = jnp.where(rows < 0, NONE_EXCLUDED - 1, point_label)
+    distance = knn_distances(
+        occupancy.features, points, config.num_neighbors, exclude=label, labels=point_label
+    )[:, -1]
+    reward = rewards.of_distance(
+        distance, config.reward, config.reward_distance, points.shape[1]
+    )
+    alive = (occupancy.weight > 0).astype(jnp.float32)
+    capacity = jax.tree.leaves(archive.parameters)[0].shape[0]
+    total = jnp.zeros(capacity).at[occupancy.policy].add(jnp.where(alive > 0, reward, 0.0))
+    lived = jnp.zeros(capacity).at[occupancy.policy].add(alive)
+    played = jnp.zeros(capacity).at[occupancy.episode_policy].add(1.0)
+    return Scores(total / jnp.maximum(played, 1), total / jnp.maximum(lived, 1))
+
+
+def best(scores: Scores, occupancy: Occupancy) -> jax.Array:
+    """[] int32: the policy of highest return among those that played."""
+    capacity = scores.episode_return.shape[0]
+    played = jnp.zeros(capacity, bool).at[occupancy.episode_policy].set(True)
+    return jnp.argmax(jnp.where(played, scores.episode_return, -jnp.inf)).astype(jnp.int32)

@@ -1,0 +1,140 @@
+"""The SAC learner: init, update, act. Settings come from a Config; sizes from the caller."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from maxent_jax.config import Config
+from maxent_jax.sac import losses
+from maxent_jax.sac.networks import Actor, Critic, Inputs
+from maxent_jax.types import Metrics
+
+
+class Parameters(NamedTuple):
+    """What the mixture archives of an agent."""
+
+    actor: Any
+    critic: Any
+    target_critic: Any
+    log_temperature: jax.Array  # []
+
+
+class Agent(NamedTuple):
+    """A learner: what it knows, and its optimisers' state."""
+
+    parameters: Parameters
+    optimizer: Any
+
+
+class Sac(NamedTuple):
+    """The fixed part of a learner: modules, and the transform from observation to inputs."""
+
+    actor: Actor
+    critic: Critic
+    inputs: Inputs
+    observation_size: int
+    action_size: int
+    target_entropy: float
+    initial_temperature: float
+    discount: float
+    soft_update_rate: float
+    optimizer: optax.GradientTransformation
+
+
+def make(config: Config, observation_size: int, action_size: int, inputs: Inputs) -> Sac:
+    """A learner of that size, with the settings of the config."""
+    return Sac(
+        actor=Actor(action_size, config.hidden_layers, config.hidden_size),
+        critic=Critic(config.hidden_layers, config.hidden_size, config.critic_layer_norm),
+        inputs=inputs,
+        observation_size=observation_size,
+        action_size=action_size,
+        target_entropy=-config.target_entropy_scale * action_size,
+        initial_temperature=config.initial_temperature,
+        discount=config.discount,
+        soft_update_rate=config.soft_update_rate,
+        optimizer=optax.adam(config.learning_rate),
+    )
+
+
+def init(sac: Sac, key: jax.Array) -> Agent:
+    """A fresh learner."""
+    key_actor, key_critic = jax.random.split(key)
+    inputs = sac.inputs(jnp.zeros(sac.observation_size))
+    critic = sac.critic.init(key_critic, inputs, jnp.zeros(sac.action_size))
+    return restart(
+        sac,
+        Parameters(
+            actor=sac.actor.init(key_actor, inputs),
+            critic=critic,
+            target_critic=jax.tree.map(jnp.copy, critic),  # two buffers, so both can be donated
+            log_temperature=jnp.log(jnp.asarray(sac.initial_temperature, jnp.float32)),
+        ),
+    )
+
+
+def restart(sac: Sac, parameters: Parameters) -> Agent:
+    """A learner that knows what `parameters` know, with fresh optimisers."""
+    return Agent(parameters, sac.optimizer.init(_learned(parameters)))
+
+
+def act(sac: Sac, actor: Any, observation: jax.Array, key: jax.Array) -> jax.Array:
+    """An action drawn from the policy: [..., D] -> [..., A] in [-1, 1]."""
+    mean, log_std = sac.actor.apply(actor, sac.inputs(observation))
+    return jnp.tanh(mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape))
+
+
+def update(sac: Sac, agent: Agent, batch: losses.Batch, key: jax.Array) -> tuple[Agent, Metrics]:
+    """One gradient step of critics, actor and temperature, and of the target critics after them."""
+    key_next, key_actor = jax.random.split(key)
+    parameters = agent.parameters
+    inputs = sac.inputs(batch.observation)
+    target = _target(sac, parameters, batch, key_next)
+
+    def critic_loss(critic):
+        values = lambda x, a: sac.critic.apply(critic, x, a)
+        return losses.critic_loss(values, target, batch, inputs)
+
+    def actor_loss(actor):
+        action, log_prob = losses.sample_action(*sac.actor.apply(actor, inputs), key_actor)
+        values = sac.critic.apply(parameters.critic, inputs, action)
+        temperature = jnp.exp(parameters.log_temperature)
+        return losses.actor_loss(log_prob, values, temperature), log_prob
+
+    def temperature_loss(log_temperature):
+        return losses.temperature_loss(log_temperature, log_prob, sac.target_entropy)
+
+    critic_value, critic_gradient = jax.value_and_grad(critic_loss)(parameters.critic)
+    (actor_value, log_prob), actor_gradient = jax.value_and_grad(actor_loss, has_aux=True)(
+        parameters.actor
+    )
+    temperature_gradient = jax.grad(temperature_loss)(parameters.log_temperature)
+
+    gradients = (actor_gradient, critic_gradient, temperature_gradient)
+    steps, optimizer = sac.optimizer.update(gradients, agent.optimizer)
+    actor, critic, log_temperature = optax.apply_updates(_learned(parameters), steps)
+    target_critic = optax.incremental_update(
+        critic, parameters.target_critic, sac.soft_update_rate
+    )
+    metrics = {
+        "critic_loss": critic_value,
+        "actor_loss": actor_value,
+        "policy_entropy": -jnp.mean(log_prob),
+        "temperature": jnp.exp(log_temperature),
+        "value": jnp.mean(target),
+    }
+    return Agent(Parameters(actor, critic, target_critic, log_temperature), optimizer), metrics
+
+
+def _target(sac: Sac, parameters: Parameters, batch: losses.Batch, key: jax.Array) -> jax.Array:
+    inputs = sac.inputs(batch.next_observation)
+    action, log_prob = losses.sample_action(*sac.actor.apply(parameters.actor, inputs), key)
+    values = sac.critic.apply(parameters.target_critic, inputs, action)
+    next_value = jnp.min(values, axis=-1) - jnp.exp(parameters.log_temperature) * log_prob
+    return losses.bellman_target(batch, next_value, sac.discount)
+
+
+def _learned(parameters: Parameters) -> tuple:
+    return parameters.actor, parameters.critic, parameters.log_temperature

@@ -1,0 +1,59 @@
+"""The actor and the twin critics; the only flax modules of the package."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+LOG_STD_RANGE = (-5.0, 2.0)  # of the Gaussian before the tanh
+
+
+class Torso(nn.Module):
+    """Hidden layers of one size, ReLU; with layer norm before each ReLU where asked."""
+
+    num_layers: int
+    size: int
+    layer_norm: bool
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        for _ in range(self.num_layers):
+            x = nn.Dense(self.size)(x)
+            if self.layer_norm:
+                x = nn.LayerNorm()(x)
+            x = nn.relu(x)
+        return x
+
+
+class Actor(nn.Module):
+    """[..., I] -> mean and log standard deviation, [..., A] each, of the action before its tanh."""
+
+    action_size: int
+    num_layers: int
+    size: int
+
+    @nn.compact
+    def __call__(self, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        x = Torso(self.num_layers, self.size, layer_norm=False)(inputs)
+        mean, log_std = jnp.split(nn.Dense(2 * self.action_size)(x), 2, axis=-1)
+        return mean, jnp.clip(log_std, *LOG_STD_RANGE)
+
+
+class Critic(nn.Module):
+    """[..., I], [..., A] -> Q [..., 2]: two networks that share nothing."""
+
+    num_layers: int
+    size: int
+    layer_norm: bool
+
+    @nn.compact
+    def __call__(self, inputs: jax.Array, action: jax.Array) -> jax.Array:
+        x = jnp.concatenate([inputs, action], axis=-1)
+        values = [
+            nn.Dense(1)(Torso(self.num_layers, self.size, self.layer_norm)(x)) for _ in range(2)
+        ]
+        return jnp.concatenate(values, axis=-1)
+
+
+Inputs = Callable[[jax.Array], jax.Array]  # observation [..., D] -> what the networks see [..., I]

@@ -1,0 +1,43 @@
+"""The records that travel between modules, and the one legend of axis letters.
+
+N envs, T time, B batch, D state, A action, F feature, M reference points, K neighbours,
+P policies, S seeds. Leading axes come first in every shape; `...` stands for any of them.
+"""
+
+from typing import NamedTuple
+
+import jax
+
+Metrics = dict[str, jax.Array]
+"""Diagnostics by name; nothing in it is needed for the next step."""
+
+
+class Transition(NamedTuple):
+    """One environment step.
+
+    `next_observation` is the true state reached, also where the next episode starts from another.
+    Where `valid` is false the simulator left the finite numbers: the step ended its episode, and
+    nothing but the count of such steps may use it.
+    """
+
+    observation: jax.Array  # [..., D]
+    action: jax.Array  # [..., A], in [-1, 1]
+    next_observation: jax.Array  # [..., D]
+    terminated: jax.Array  # [...] bool: health failed
+    truncated: jax.Array  # [...] bool: time limit alone
+    valid: jax.Array  # [...] bool
+
+
+class Experience(NamedTuple):
+    """What the replay holds of a transition.
+
+    The two distances are R to the current reference; they are measured anew when it changes.
+    """
+
+    observation: jax.Array  # [..., D]
+    action: jax.Array  # [..., A], in [-1, 1]
+    next_observation: jax.Array  # [..., D]
+    discount: jax.Array  # [...] 0 where health failed, else 1
+    bonus: jax.Array  # [...] episodic term, feature units
+    distance: jax.Array  # [...] R(s), feature units
+    next_distance: jax.Array  # [...] R(s'), feature units
