@@ -1,30 +1,78 @@
 """What every benchmark prints and measures alike."""
 
+import argparse
+import importlib
 import importlib.metadata
+import json
 import os
 import platform
 import statistics
+import sys
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable
+from types import ModuleType
+from typing import Any, NamedTuple
 
 import jax
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "numpy")
+CORES = os.cpu_count() or 1
+REPEATS = 5
 
 
-def print_versions() -> None:
+class Peer(NamedTuple):
+    """Another library that answers the same question; no dependency of ours."""
+
+    distribution: str
+    module: str
+    measure: Callable  # takes the imported module first
+
+
+def parser(description: str | None) -> argparse.ArgumentParser:
+    """The flags that benchmarks share."""
+    flags = argparse.ArgumentParser(description=description)
+    flags.add_argument("--toy", action="store_true", help="does it run? tiny sizes, no figures")
+    flags.add_argument("--repeats", type=int, default=REPEATS, help="of which the median is taken")
+    return flags
+
+
+def print_versions(peers: Iterable[Peer] = ()) -> None:
     """The first line of every benchmark: what was measured, on what."""
     versions = " ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
+    for peer in peers:
+        try:
+            versions += f" {peer.distribution} {importlib.metadata.version(peer.distribution)}"
+        except importlib.metadata.PackageNotFoundError:
+            continue
     device = jax.devices()[0]
     print(
         f"# python {platform.python_version()} {versions} | {device.platform} "
-        f"{device.device_kind}, {os.cpu_count()} CPU cores",
+        f"{device.device_kind}, {CORES} CPU cores",
         flush=True,
     )
 
 
-def median_seconds(call: Callable[[], Any], repeats: int = 5) -> float:
+def importable(peers: Iterable[Peer]) -> list[tuple[Peer, ModuleType]]:
+    """Those that can be measured here; the others are named in one line on standard error."""
+    found, absent = [], []
+    for peer in peers:
+        try:
+            found.append((peer, importlib.import_module(peer.module)))
+        except Exception as error:  # one that is installed but broken raises anything at all
+            absent.append(f"{peer.distribution} ({type(error).__name__}: {error})")
+    if absent:
+        print("not measured: " + "; ".join(absent), file=sys.stderr)
+    return found
+
+
+def compiled(function: Callable, *args: Any) -> tuple[Callable, float]:
+    """The function compiled for arguments like these, and the seconds that took."""
+    started = time.perf_counter()
+    program = jax.jit(function).lower(*args).compile()
+    return program, time.perf_counter() - started
+
+
+def median_seconds(call: Callable[[], Any], repeats: int = REPEATS) -> float:
     """Median time of a call that returns arrays, after one call to warm up."""
     jax.block_until_ready(call())
     seconds = []
@@ -33,3 +81,15 @@ def median_seconds(call: Callable[[], Any], repeats: int = 5) -> float:
         jax.block_until_ready(call())
         seconds.append(time.perf_counter() - started)
     return statistics.median(seconds)
+
+
+def progress(row: dict[str, Any]) -> dict[str, Any]:
+    """The row at four significant digits, shown on standard error as soon as it is measured."""
+    row = {k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in row.items()}
+    print(" ".join(f"{name}={value}" for name, value in row.items()), file=sys.stderr, flush=True)
+    return row
+
+
+def emit(row: dict[str, Any]) -> None:
+    """One JSON line on standard output."""
+    print(json.dumps(row), flush=True)

@@ -6,7 +6,6 @@ and update as in training, but paid for metres per second along x.
 
 import argparse
 import functools
-import json
 import sys
 import time
 
@@ -25,9 +24,8 @@ def init(config: Config, key: jax.Array):
     p = parts.make(config)
     key_agent, key_episodes = jax.random.split(key)
     episodes = base.init(p.env, config.num_envs, config.num_starts, key_episodes)
-    state = jax.ShapeDtypeStruct((p.sac.observation_size,), jnp.float32)
-    action = jax.ShapeDtypeStruct((p.sac.action_size,), jnp.float32)
-    scalar = jax.ShapeDtypeStruct((), jnp.float32)
+    scalar, state = jnp.zeros(()), jnp.zeros(p.sac.observation_size)
+    action = jnp.zeros(p.sac.action_size)
     ring = replay.init(losses.Batch(state, action, scalar, state, scalar), config.replay_size)
     return agent.init(p.sac, key_agent), episodes, ring
 
@@ -88,7 +86,7 @@ def main() -> None:
         "mean_velocity_last_segment": round(velocity, 3),
         "wall_seconds": round(time.perf_counter() - started, 1),
     }
-    print(json.dumps(row))
+    common.emit(row)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ between calls the same three. A method is data in the state, so all methods shar
 """
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -16,10 +17,9 @@ import jax.numpy as jnp
 
 from maxent_jax import methods, mixture, occupancy, parts, training
 from maxent_jax.config import Config
-from maxent_jax.density import entropy, histogram, reservoir
+from maxent_jax.density import histogram, reservoir
 from maxent_jax.envs import base
 from maxent_jax.mixture import Archive
-from maxent_jax.occupancy import Occupancy
 from maxent_jax.parts import Parts
 from maxent_jax.sac import agent
 from maxent_jax.sac.agent import Agent
@@ -40,13 +40,22 @@ class State(NamedTuple):
 
 
 # With seeds side by side every leaf has a leading axis [S, ...], but for the method, which they
-# share: jax.vmap(f, SEED_AXES, SEED_AXES) for f: State -> State.
+# share: jax.vmap(f, (SEED_AXES,), SEED_AXES) for f: State -> State.
 SEED_AXES = State(key=0, iteration=0, method=None, archive=0, learner=0)  # type: ignore[arg-type]
 
 
 def init(config: Config, key: jax.Array) -> State:
     """Before the first iteration: π_0, untrained, is the whole mixture."""
     return _init(config.program(), methods.make(config), key)
+
+
+def start(config: Config) -> State:
+    """The first state of all the config's seeds, with a seed axis if they are more than one."""
+    if config.num_seeds == 1:
+        return init(config, jax.random.key(config.seed))
+    seeds = config.seed + jnp.arange(config.num_seeds)
+    keys = jax.vmap(jax.random.key)(seeds)
+    return jax.vmap(functools.partial(init, config), out_axes=SEED_AXES)(keys)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -82,15 +91,13 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
     best = occupancy.best(scores, visited)
     learner = learner._replace(
         agent=_start(p, method, archive, learner.agent, best, key_scratch),
-        replay=learner.replay._replace(
-            items=training.measure(p, reference, learner.replay.items)
-        ),
+        replay=learner.replay._replace(items=training.measure(p, reference, learner.replay.items)),
         reference=reference,
         history=history,
     )
     metrics = {
         "weights": weights,
-        "effective_policies": jnp.exp(-jnp.sum(weights * jnp.log(jnp.maximum(weights, 1e-38)))),
+        "effective_policies": jnp.exp(-jnp.sum(weights * jnp.log(jnp.maximum(weights, 1e-30)))),
         "best_policy": best,
         "policy_return": scores.episode_return,
         "policy_step_reward": scores.step_reward,
@@ -129,7 +136,7 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
         "gradient_steps": learner.gradient_steps,
         **_coverage("cumulative", learner.visits),
         **(_coverage("random", learner.random_visits) if config.random_baseline else {}),
-        **_mixture_metrics(p, visited, key_rows),
+        **occupancy.measures(p, visited, key_rows),
     }
     return state, metrics
 
@@ -147,6 +154,30 @@ def iterate(config: Config, state: State) -> tuple[State, Metrics]:
 def run(config: Config, state: State, num_iterations: int) -> tuple[State, Metrics]:
     """That many iterations as one program; metrics [T, ...]. Jit it with the state donated."""
     return jax.lax.scan(lambda s, _: iterate(config, s), state, length=num_iterations)
+
+
+class Programs(NamedTuple):
+    """The three compiled functions of an iteration, State -> State and Metrics; state donated."""
+
+    begin: Callable[[State], tuple[State, Metrics]]
+    train_segment: Callable[[State], tuple[State, Metrics]]
+    end: Callable[[State], tuple[State, Metrics]]
+
+
+def programs(config: Config) -> Programs:
+    """What a driver calls to log and save in between; compiled once for each program."""
+    return _programs(config.program(), config.num_seeds > 1)
+
+
+@functools.lru_cache(maxsize=8)
+def _programs(config: Config, seed_axis: bool) -> Programs:
+    def compiled(f):
+        f = functools.partial(f, config)
+        if seed_axis:
+            f = jax.vmap(f, in_axes=(SEED_AXES,), out_axes=(SEED_AXES, 0))
+        return jax.jit(f, donate_argnums=0)
+
+    return Programs(compiled(begin), compiled(train_segment), compiled(end))
 
 
 def reduce_metrics(metrics: Metrics) -> Metrics:
@@ -169,9 +200,7 @@ def _start(
     scratch = agent.init(p.sac, key)
     restored = agent.restart(p.sac, mixture.policy(archive, best))
     candidates = dict(scratch=scratch, last=last, best=restored)
-    stacked = jax.tree.map(
-        lambda *x: jnp.stack(x), *(candidates[name] for name in methods.STARTS)
-    )
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *(candidates[name] for name in methods.STARTS))
     chosen = jax.tree.map(lambda x: x[method.start], stacked)
     if not p.config.restart_temperature:
         return chosen
@@ -185,19 +214,4 @@ def _coverage(of: str, visits: training.Visits) -> Metrics:
         f"{of}_coverage": histogram.coverage(visits.cells),
         f"{of}_entropy": histogram.shannon_entropy(visits.cells),
         f"{of}_off_grid_share": visits.off_grid / jnp.maximum(on_grid + visits.off_grid, 1),
-    }
-
-
-def _mixture_metrics(p: Parts, visited: Occupancy, key: jax.Array) -> Metrics:
-    config, grid = p.config, p.env.task.grid
-    cells = histogram.count(visited.states, grid, visited.weight)
-    rows = mixture.draw_rows(visited.weight, config.reference_size, key)
-    sample = visited.features[rows]
-    lived = jnp.sum(visited.weight > 0) / config.mixture_episodes
-    return {
-        "mixture_coverage": histogram.coverage(cells),
-        "mixture_entropy": histogram.shannon_entropy(cells),
-        "mixture_off_grid_share": 1 - jnp.sum(cells),
-        "mixture_knn_entropy": entropy.knn_entropy(sample, config.num_neighbors, labels=rows),
-        "mixture_episode_length": lived,
     }

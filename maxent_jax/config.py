@@ -10,6 +10,7 @@ BACKENDS = ("auto", "mjx", "mujoco", "warp")
 PHYSICS = ("reference", "fast")
 REWARDS = ("log1p", "linear", "log", "paper")
 INPUTS = ("state", "heading")
+SPACES = ("features", "position")
 WEIGHTS = ("method", "uniform", "geometric")
 REFERENCES = ("method", "mixture", "history")
 STARTS = ("method", "scratch", "last", "best")
@@ -71,6 +72,9 @@ class Config:
     """Factor on the whole reward that SAC sees."""
     shaping: float = 0.0
     """Potential-based shaping: the potential, as a multiple of the reward's form. 0: none."""
+    shaping_space: str = "features"
+    """Where the potential's distance is measured: features (it is R), or position (the first two
+    alone: free of the noise of the joints)."""
     shaping_survives_death: bool = False
     """A state in which health fails keeps its potential: faster, and not policy-invariant."""
     episodic_weight: float = 0.0
@@ -150,15 +154,15 @@ class Config:
         Configs with equal programs share one compilation; the data enters the state in
         `algorithm.init`.
         """
-        return dataclasses.replace(
-            self,
-            **{name: _DEFAULTS[name] for name in DATA_FIELDS},
-        )
+        defaults: dict[str, Any] = {name: _DEFAULTS[name] for name in DATA_FIELDS}
+        return dataclasses.replace(self, **defaults)
 
     def deviations(self) -> dict[str, str]:
         """What this config does otherwise than the paper, by field."""
         return {
-            name: why for name, (departs, why) in _DEVIATIONS.items() if departs(getattr(self, name))
+            name: why
+            for name, (departs, why) in _DEVIATIONS.items()
+            if departs(getattr(self, name))
         }
 
 
@@ -177,6 +181,7 @@ _DEVIATIONS: dict[str, tuple[Any, str]] = {
     "reward": (lambda x: x != "paper", "the reward's form is not p log R"),
     "reward_scale": (lambda x: x != 1, "the reward is scaled"),
     "shaping": (lambda x: x != 0, "the reward is shaped by a potential"),
+    "shaping_space": (lambda x: x != "features", "the potential is measured in position alone"),
     "shaping_survives_death": (lambda x: x, "the potential survives death: not policy-invariant"),
     "episodic_weight": (lambda x: x == 0, "no episodic term"),
     "leave_own_out": (lambda x: x, "policies are scored without their own states"),
@@ -208,8 +213,10 @@ PRESETS: dict[str, dict[str, Any]] = {
         end_flipped=True,
         policy_inputs="heading",
         yaw_copies=1,
-        shaping=10.0,
+        shaping=100.0,
+        shaping_space="position",
         shaping_survives_death=True,
+        reward_scale=2.0,
         hidden_size=128,
         critic_layer_norm=True,
         learning_rate=1e-3,
@@ -257,6 +264,7 @@ _CHOICES = {
     "physics": PHYSICS,
     "reward": REWARDS,
     "policy_inputs": INPUTS,
+    "shaping_space": SPACES,
     "weights": WEIGHTS,
     "reference": REFERENCES,
     "start": STARTS,
@@ -296,6 +304,8 @@ def _check(config: Config) -> None:
 
 
 def _check_together(c: Config) -> None:
+    if c.backend == "warp":
+        raise ConfigError("backend warp is not part of this release: choose auto, mjx or mujoco.")
     group = c.num_envs * c.num_segments
     updates = c.updates_per_step * c.num_envs
     for wrong, sentence in (
@@ -306,7 +316,7 @@ def _check_together(c: Config) -> None:
         ),
         (
             updates < 1 or updates != round(updates),
-            f"updates-per-step × num-envs is {updates:g}, but must be a whole number of at least 1.",
+            f"updates-per-step × num-envs is {updates:g}, but must be a whole number from 1 up.",
         ),
         (
             c.num_neighbors >= c.reference_size,

@@ -25,6 +25,7 @@ class FeatureMap:
     names: tuple[str, ...]
 
     def __call__(self, observation: jax.Array) -> jax.Array:
+        """[..., D] -> [..., 7]."""
         kept = observation[..., list(self.coordinates)]
         rest = jnp.delete(observation, np.array(self.coordinates), axis=-1)
         projected = jnp.matmul(

@@ -27,7 +27,8 @@ def append(archive: Archive, parameters: Parameters) -> Archive:
     stored = jax.tree.map(
         lambda slots, x: slots.at[archive.size].set(x, mode="drop"), archive.parameters, parameters
     )
-    return Archive(stored, archive.size + 1)
+    capacity = jax.tree.leaves(stored)[0].shape[0]
+    return Archive(stored, jnp.minimum(archive.size + 1, capacity))
 
 
 def policy(archive: Archive, index: jax.Array) -> Parameters:
@@ -107,7 +108,9 @@ def draw_rows(weights: jax.Array, num: int, key: jax.Array) -> jax.Array:
 
 
 def _inverse_cumulative(weights: jax.Array, ticks: jax.Array) -> jax.Array:
-    cumulative = jnp.cumsum(weights)
+    # A parallel sum rounds each prefix by itself: without the running maximum it may fall, or rise
+    # at a row of weight 0.
+    cumulative = jax.lax.cummax(jnp.where(weights > 0, jnp.cumsum(weights), 0.0))
     row = jnp.searchsorted(cumulative, ticks * cumulative[-1], side="right")
     # Rounding may push the last tick past the end; the last row with weight takes it.
     last = weights.shape[0] - 1 - jnp.argmax(weights[::-1] > 0)

@@ -4,13 +4,16 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import State
 
 from maxent_jax import mixture, rewards, rollout
+from maxent_jax.density import entropy, histogram
 from maxent_jax.density.knn import NONE_EXCLUDED, knn_distances
+from maxent_jax.envs.base import State
 from maxent_jax.mixture import Archive
 from maxent_jax.parts import Parts
+from maxent_jax.rollout import Trajectories
 from maxent_jax.sac import agent
+from maxent_jax.types import Metrics
 
 
 class Occupancy(NamedTuple):
@@ -19,7 +22,8 @@ class Occupancy(NamedTuple):
     states: jax.Array  # [R, D]
     features: jax.Array  # [R, F]
     policy: jax.Array  # [R] int32, who reached it
-    weight: jax.Array  # [R], sums to 1; 0 after an episode's end
+    weight: jax.Array  # [R], sums to 1; 0 after an episode's end, or for a policy of weight 0
+    alive: jax.Array  # [R] bool: reached before its episode's end
     episode_policy: jax.Array  # [E] int32
     num_invalid: jax.Array  # [] int32
 
@@ -53,14 +57,7 @@ def of_mixture(
         plays = (slots < archive.size) / archive.size
         offset = jnp.asarray(0.5)
     episode_policy = mixture.assign_episodes(plays, config.mixture_episodes, offset)
-    actors = mixture.policy(archive, episode_policy).actor
-
-    def act(observation, key_step):
-        keys = jax.random.split(key_step, config.mixture_episodes)
-        one = lambda actor, s, k: agent.act(parts.sac, actor, s, k)
-        return jax.vmap(one)(actors, observation, keys)
-
-    reached = rollout.episodes(parts.env, starts, act, config.episode_length, key_act)
+    reached = play(parts, archive, episode_policy, starts, key_act)
     states = reached.states.reshape(-1, reached.states.shape[-1])
     policy = jnp.broadcast_to(episode_policy, reached.alive.shape).reshape(-1)
     alive = reached.alive.reshape(-1).astype(jnp.float32)
@@ -74,9 +71,27 @@ def of_mixture(
         features=parts.phi(states),
         policy=policy,
         weight=weight / jnp.sum(weight),
+        alive=alive > 0,
         episode_policy=episode_policy,
         num_invalid=reached.num_invalid,
     )
+
+
+def play(
+    parts: Parts, archive: Archive, episode_policy: jax.Array, starts: State, key: jax.Array
+) -> Trajectories:
+    """Episodes from `starts` [E, ...], each played by the policy in its slot, [E] int32.
+
+    Every episode holds its own copy of the actor's weights: E times their size in memory.
+    """
+    actors = mixture.policy(archive, episode_policy).actor
+
+    def act(observation, key_step):
+        keys = jax.random.split(key_step, episode_policy.shape[0])
+        one = lambda actor, s, k: agent.act(parts.sac, actor, s, k)
+        return jax.vmap(one)(actors, observation, keys)
+
+    return rollout.episodes(parts.env, starts, act, parts.config.episode_length, key)
 
 
 def score(
@@ -102,10 +117,8 @@ def score(
     distance = knn_distances(
         occupancy.features, points, config.num_neighbors, exclude=label, labels=point_label
     )[:, -1]
-    reward = rewards.of_distance(
-        distance, config.reward, config.reward_distance, points.shape[1]
-    )
-    alive = (occupancy.weight > 0).astype(jnp.float32)
+    reward = rewards.of_distance(distance, config.reward, config.reward_distance, points.shape[1])
+    alive = occupancy.alive.astype(jnp.float32)
     capacity = jax.tree.leaves(archive.parameters)[0].shape[0]
     total = jnp.zeros(capacity).at[occupancy.policy].add(jnp.where(alive > 0, reward, 0.0))
     lived = jnp.zeros(capacity).at[occupancy.policy].add(alive)
@@ -118,3 +131,18 @@ def best(scores: Scores, occupancy: Occupancy) -> jax.Array:
     capacity = scores.episode_return.shape[0]
     played = jnp.zeros(capacity, bool).at[occupancy.episode_policy].set(True)
     return jnp.argmax(jnp.where(played, scores.episode_return, -jnp.inf)).astype(jnp.int32)
+
+
+def measures(parts: Parts, occupancy: Occupancy, key: jax.Array) -> Metrics:
+    """Coverage and entropies of the mixture, on the environment's grid and in feature space."""
+    config = parts.config
+    cells = histogram.count(occupancy.states, parts.env.task.grid, occupancy.weight)
+    rows = mixture.draw_rows(occupancy.weight, config.reference_size, key)
+    sample = occupancy.features[rows]
+    return {
+        "mixture_coverage": histogram.coverage(cells),
+        "mixture_entropy": histogram.shannon_entropy(cells),
+        "mixture_off_grid_share": jnp.maximum(1 - jnp.sum(cells), 0.0),  # sums round
+        "mixture_knn_entropy": entropy.knn_entropy(sample, config.num_neighbors, labels=rows),
+        "mixture_episode_length": jnp.sum(occupancy.weight > 0) / config.mixture_episodes,
+    }

@@ -45,12 +45,13 @@ def of_distance(distance: jax.Array, form: str, scale: float, dims: int) -> jax.
     """The reward of a state at distance R, [...] -> [...], dimensionless.
 
     Args:
-      distance: R, feature units; inf counts as the largest float32, so that no reward is infinite.
+      distance: R, feature units; inf counts as about the largest float32 whose R/c is one too, so
+        that no reward is infinite.
       form: one of FORMS.
       scale: c, feature units.
       dims: p, the number of features.
     """
-    largest = jnp.finfo(jnp.float32).max
+    largest = 0.5 * jnp.finfo(jnp.float32).max * jnp.minimum(scale, 1.0)  # half: c rounds
     return FORMS[form](jnp.minimum(distance, largest), scale, dims)
 
 
@@ -107,11 +108,11 @@ def shaped(
     reward: jax.Array,
     potential: jax.Array,
     next_potential: jax.Array,
-    discount: jax.Array,
+    discount: float,
     alive: jax.Array,
     survives_death: bool,
 ) -> jax.Array:
-    """r + γΦ(s') - Φ(s), all [...].
+    """r + γΦ(s') - Φ(s), all [...] but for γ, `discount`.
 
     With Φ = 0 at a terminal state the optimal policies are those of r (Ng et al. 1999). With
     `survives_death` a state in which health fails keeps its Φ: it learns faster, since a death far
@@ -140,7 +141,7 @@ def episodic_bonus(
     Source: the paper's appendix; Badia et al. 2020 (NGU).
     """
     squared = jnp.sum((earlier - features[..., None, :]) ** 2, axis=-1)
-    filled = jnp.arange(earlier.shape[-2]) < count[..., None]
+    filled = jax.lax.broadcasted_iota(jnp.int32, squared.shape, squared.ndim - 1) < count[..., None]
     nearest = jnp.sqrt(smallest_k(jnp.where(filled, squared, jnp.inf), num_neighbors))
     available = jnp.minimum(count, num_neighbors)
     total = jnp.sum(jnp.where(jnp.isfinite(nearest), nearest, 0.0), axis=-1)

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env, State
 
 from maxent_jax.envs import base
+from maxent_jax.envs.base import Env, State
 
 
 class Trajectories(NamedTuple):

@@ -19,12 +19,14 @@ from maxent_jax.sac.agent import Agent
 from maxent_jax.sac.replay import Replay
 from maxent_jax.types import Experience, Metrics, Transition
 
+POSITION_DIMS = 2  # the features that are metres, first in every feature map
+
 
 class Reference(NamedTuple):
-    """The states that define r_t; the first `count` points are filled."""
+    """The states that define r_t; the first `num_filled` points are there."""
 
     points: jax.Array  # [M, F]
-    count: jax.Array  # [] int32
+    num_filled: jax.Array  # [] int32
 
 
 class Visits(NamedTuple):
@@ -40,7 +42,7 @@ class Learner(NamedTuple):
     agent: Agent
     replay: Replay
     episodes: Episodes  # [N] of the agent; then, with the random baseline, [N] of that
-    memory: jax.Array  # [N, T, F] states of each episode so far; T = 0 without the episodic term
+    memory: jax.Array | None  # [N, T, F] states of each episode so far, for the episodic term
     reference: Reference
     history: Reservoir
     visits: Visits
@@ -55,19 +57,18 @@ def init(parts: Parts, key: jax.Array) -> Learner:
     key_agent, key_episodes = jax.random.split(key)
     num_rows = config.num_envs * (2 if config.random_baseline else 1)
     dims = len(parts.phi.names)
-    scalar = jax.ShapeDtypeStruct((), jnp.float32)
-    state = jax.ShapeDtypeStruct((sac.observation_size,), jnp.float32)
-    action = jax.ShapeDtypeStruct((sac.action_size,), jnp.float32)
-    memory_length = config.episode_length if config.episodic_weight > 0 else 0
+    scalar, state = jnp.zeros(()), jnp.zeros(sac.observation_size)
+    action = jnp.zeros(sac.action_size)
+    memory = None
+    if config.episodic_weight > 0:
+        memory = jnp.zeros((config.num_envs, config.episode_length, dims))
     zero = jnp.zeros((), jnp.int32)
     unvisited = Visits(jnp.zeros(parts.env.task.grid.bins, jnp.int32), zero)
     return Learner(
         agent=sac_agent.init(sac, key_agent),
-        replay=replay.init(
-            Experience(state, action, state, *([scalar] * 4)), config.replay_size
-        ),
+        replay=replay.init(Experience(state, action, state, *([scalar] * 5)), config.replay_size),
         episodes=base.init(parts.env, num_rows, config.num_starts, key_episodes),
-        memory=jnp.zeros((config.num_envs, memory_length, dims)),
+        memory=memory,
         reference=Reference(jnp.zeros((config.reference_size, dims)), zero),
         history=reservoir.init(config.reference_size, dims),
         visits=unvisited,
@@ -77,9 +78,7 @@ def init(parts: Parts, key: jax.Array) -> Learner:
     )
 
 
-def step(
-    parts: Parts, method: Method, learner: Learner, key: jax.Array
-) -> tuple[Learner, Metrics]:
+def step(parts: Parts, method: Method, learner: Learner, key: jax.Array) -> tuple[Learner, Metrics]:
     """All envs once, then the gradient steps that go with it. Metrics named num_ are counts."""
     config = parts.config
     key_act, key_random, key_env, key_history, key_yaw, key_learn = jax.random.split(key, 6)
@@ -126,23 +125,24 @@ def step(
 
 
 def measure(parts: Parts, reference: Reference, experience: Experience) -> Experience:
-    """The experience [B, ...] with its distances to the reference.
-
-    R(s) is needed by the shaping alone, and 0 without it.
-    """
+    """The experience [B, ...] with its distances to the reference, in place of any it had."""
     config = parts.config
-    ends = [experience.next_observation]
-    if config.shaping > 0:
-        ends.append(experience.observation)
-    distance = knn_distances(
-        parts.phi(jnp.concatenate(ends)),
-        reference.points,
-        config.num_neighbors,
-        count=reference.count,
-    )[:, -1]
-    num_rows = experience.discount.shape[0]
-    before = distance[num_rows:] if config.shaping > 0 else jnp.zeros(num_rows)
-    return experience._replace(distance=before, next_distance=distance[:num_rows])
+
+    def distance(features):
+        dims = features.shape[1]
+        nearest = knn_distances(
+            features, reference.points[:, :dims], config.num_neighbors, count=reference.num_filled
+        )
+        return nearest[:, -1]
+
+    after = parts.phi(experience.next_observation)
+    experience = experience._replace(distance=distance(after))
+    if config.shaping == 0:
+        return experience
+    dims = POSITION_DIMS if config.shaping_space == "position" else after.shape[1]
+    ends = jnp.concatenate([parts.phi(experience.observation), after])
+    before, after = jnp.split(distance(ends[:, :dims]), 2)
+    return experience._replace(potential_distance=before, next_potential_distance=after)
 
 
 def unshaped_reward(parts: Parts, distance: jax.Array) -> jax.Array:
@@ -156,13 +156,14 @@ def unshaped_reward(parts: Parts, distance: jax.Array) -> jax.Array:
 def reward(parts: Parts, experience: Experience) -> jax.Array:
     """What SAC is paid for a transition, [...]: r_t, its shaping, and the episodic term."""
     config = parts.config
-    form = unshaped_reward(parts, experience.next_distance)
+    form = unshaped_reward(parts, experience.distance)
     paid = form + config.episodic_weight * experience.bonus
     if config.shaping > 0:
         paid = rewards.shaped(
             paid,
-            potential=config.shaping * unshaped_reward(parts, experience.distance),
-            next_potential=config.shaping * form,
+            potential=config.shaping * unshaped_reward(parts, experience.potential_distance),
+            next_potential=config.shaping
+            * unshaped_reward(parts, experience.next_potential_distance),
             discount=config.discount,
             alive=experience.discount,
             survives_death=config.shaping_survives_death,
@@ -170,9 +171,7 @@ def reward(parts: Parts, experience: Experience) -> jax.Array:
     return config.reward_scale * paid
 
 
-def _refreshed(
-    parts: Parts, method: Method, learner: Learner, history: Reservoir
-) -> Reference:
+def _refreshed(parts: Parts, method: Method, learner: Learner, history: Reservoir) -> Reference:
     """The reference, drawn anew where the method's period says so.
 
     The mixture's own states change only between iterations, see algorithm.begin.
@@ -182,7 +181,7 @@ def _refreshed(
     due = _changes_within_iteration(method) & (vector_step % jnp.maximum(period, 1) == 0)
     return Reference(
         jnp.where(due, history.points, learner.reference.points),
-        jnp.where(due, reservoir.count(history), learner.reference.count),
+        jnp.where(due, reservoir.count(history), learner.reference.num_filled),
     )
 
 
@@ -193,7 +192,7 @@ def _changes_within_iteration(method: Method) -> jax.Array:
 def _episodic(parts, memory, transition: Transition, features, age):
     """The episodic term of each state reached, and the memory with the states left behind."""
     config = parts.config
-    if config.episodic_weight == 0:
+    if memory is None:
         return jnp.zeros(config.num_envs), memory
     rows = jnp.arange(config.num_envs)
     memory = memory.at[rows, age].set(parts.phi(transition.observation))
@@ -211,7 +210,8 @@ def _with_yaw_copies(parts: Parts, transition: Transition, bonus: jax.Array, key
         discount=1.0 - transition.terminated.astype(jnp.float32),
         bonus=bonus,
         distance=unmeasured,
-        next_distance=unmeasured,
+        potential_distance=unmeasured,
+        next_potential_distance=unmeasured,
     )
     angles = jax.random.uniform(
         key, (config.yaw_copies, config.num_envs), minval=-jnp.pi, maxval=jnp.pi
@@ -232,9 +232,7 @@ def _visit(parts: Parts, visits: Visits, transition: Transition) -> Visits:
     grid = parts.env.task.grid
     valid = transition.valid.astype(jnp.int32)
     cells = histogram.count(transition.next_observation, grid, valid)
-    return Visits(
-        visits.cells + cells, visits.off_grid + jnp.sum(valid) - jnp.sum(cells)
-    )
+    return Visits(visits.cells + cells, visits.off_grid + jnp.sum(valid) - jnp.sum(cells))
 
 
 def _learn(
@@ -264,7 +262,7 @@ def _learn(
     keys = jax.random.split(key_update, shape[0])
     agent, metrics = jax.lax.scan(update, learner.agent, (batches, keys))
     metrics = jax.tree.map(jnp.mean, metrics)
-    unshaped = jnp.mean(unshaped_reward(parts, drawn.next_distance))
+    unshaped = jnp.mean(unshaped_reward(parts, drawn.distance))
     metrics |= {
         "replay_reward": unshaped,
         "replay_paid": jnp.mean(paid),

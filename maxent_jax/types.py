@@ -31,7 +31,7 @@ class Transition(NamedTuple):
 class Experience(NamedTuple):
     """What the replay holds of a transition.
 
-    The two distances are R to the current reference; they are measured anew when it changes.
+    The distances are to the current reference; they are measured anew when it changes.
     """
 
     observation: jax.Array  # [..., D]
@@ -39,5 +39,6 @@ class Experience(NamedTuple):
     next_observation: jax.Array  # [..., D]
     discount: jax.Array  # [...] 0 where health failed, else 1
     bonus: jax.Array  # [...] episodic term, feature units
-    distance: jax.Array  # [...] R(s), feature units
-    next_distance: jax.Array  # [...] R(s'), feature units
+    distance: jax.Array  # [...] R(s'), feature units
+    potential_distance: jax.Array  # [...] R(s) in the space of the potential; 0 without shaping
+    next_potential_distance: jax.Array  # [...] the same of s'

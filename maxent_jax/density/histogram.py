@@ -27,9 +27,9 @@ def count(states: jax.Array, grid: Grid, weights: jax.Array | None = None) -> ja
     """
     weights = jnp.ones(states.shape[0], jnp.int32) if weights is None else weights
     position = states[:, jnp.array(grid.coordinates)]
-    low, high, bins = (jnp.array(x, jnp.float32) for x in (grid.low, grid.high, grid.bins))
+    low, high, bins = (jnp.array([x], jnp.float32) for x in (grid.low, grid.high, grid.bins))
     cell = jnp.floor((position - low) / (high - low) * bins)
-    cell = jnp.where(position == high, bins - 1, cell)
+    cell = jnp.minimum(cell, bins - 1)  # the upper edge, and what rounds up to it
     inside = ((position >= low) & (position <= high)).all(-1)
     row, column = jnp.where(inside[:, None], cell, 0).astype(jnp.int32).T
     num_cells = grid.bins[0] * grid.bins[1]
@@ -45,5 +45,6 @@ def coverage(counts: jax.Array) -> jax.Array:
 
 def shannon_entropy(counts: jax.Array) -> jax.Array:
     """[] nats: entropy of the cells' visit frequencies, at most log(number of cells); 0 if none."""
-    frequency = counts / jnp.maximum(jnp.sum(counts), 1)
+    total = jnp.sum(counts)
+    frequency = counts / jnp.where(total > 0, total, 1)
     return -jnp.sum(jnp.where(counts > 0, frequency * jnp.log(jnp.maximum(frequency, 1e-38)), 0.0))

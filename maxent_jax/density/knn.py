@@ -77,7 +77,7 @@ def smallest_k(values: jax.Array, k: int) -> jax.Array:
     For short rows; `lax.top_k` sorts them whole on a CPU.
     """
     found = []
-    positions = jnp.arange(values.shape[-1])
+    positions = jax.lax.broadcasted_iota(jnp.int32, values.shape, values.ndim - 1)
     for _ in range(k):
         nearest = jnp.argmin(values, axis=-1)
         found.append(jnp.min(values, axis=-1))
@@ -97,6 +97,6 @@ def _check(queries, points, k, count) -> None:
         raise ValueError(f"k is {k}, but must be from 1 to the number of points, {available}")
     for name, value in (("queries", queries), ("points", points)):
         if not isinstance(value, jax.core.Tracer):
-            rows = value if name == "queries" else value[:available]
-            if not np.isfinite(rows).all():
+            rows = np.asarray(value)  # a jax array's slice would be traced inside jit
+            if not np.isfinite(rows if name == "queries" else rows[:available]).all():
                 raise ValueError(f"{name} hold a number that is not finite")

@@ -21,8 +21,15 @@ def add(reservoir: Reservoir, points: jax.Array, valid: jax.Array, key: jax.Arra
     """With the valid rows of `points` [B, F] having passed by."""
     capacity = reservoir.points.shape[0]
     ordinal = reservoir.seen + jnp.cumsum(valid, dtype=jnp.int32) - 1
-    slot = jnp.where(ordinal < capacity, ordinal, jax.random.randint(key, ordinal.shape, 0, ordinal + 1))
+    slot = jnp.where(
+        ordinal < capacity, ordinal, jax.random.randint(key, ordinal.shape, 0, ordinal + 1)
+    )
     slot = jnp.where(valid, slot, capacity)  # a slot beyond the last stores nothing
+    # Of rows with one slot the last stays, as if they came one by one: a scatter of several to one
+    # place has no defined order on an accelerator.
+    rows = jnp.arange(points.shape[0], dtype=jnp.int32)
+    last = jnp.zeros(capacity + 1, jnp.int32).at[slot].max(rows)
+    slot = jnp.where(rows == last[slot], slot, capacity)
     return Reservoir(
         reservoir.points.at[slot].set(points, mode="drop"),
         reservoir.seen + jnp.sum(valid, dtype=jnp.int32),

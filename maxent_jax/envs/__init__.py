@@ -1,6 +1,11 @@
 """Where states come from. `make(name)` gives a brax Env; base.py runs many of them at once."""
 
+import contextlib
+import io
 from typing import Any
+
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an option, is missing
+    import mujoco.mjx  # noqa: F401
 
 from maxent_jax.envs import ant
 from maxent_jax.envs.task import MujocoEnv

@@ -55,7 +55,7 @@ def flipped(observation: jax.Array) -> jax.Array:
 def heading_inputs(observation: jax.Array) -> jax.Array:
     """The same state in the ant's own horizontal frame, where walking looks alike everywhere.
 
-    Returns [..., 37]: position, position seen from the heading, direction outward, heading,
+    Returns [..., 34]: position, position seen from the heading, direction outward, heading,
     height, up-axis, velocities and joints; lengths of tens of metres are brought to order 1.
     """
     w, x, y, z = _quaternion(observation)
@@ -85,7 +85,9 @@ def heading_inputs(observation: jax.Array) -> jax.Array:
 def rotate(observation: jax.Array, angle: jax.Array) -> jax.Array:
     """The state with the world turned by `angle` [...] radians about the vertical at the origin.
 
-    A symmetry of the dynamics: the same actions lead from turned states to turned states.
+    A symmetry of the dynamics: the same actions lead from turned states to turned states. Where
+    the torso itself touches the ground it is one for quarter turns only, since MuJoCo's pyramid
+    of friction at a sphere lies along the world's axes.
     """
     half_cos, half_sin = jnp.cos(angle / 2), jnp.sin(angle / 2)
     w, x, y, z = _quaternion(observation)

@@ -13,6 +13,7 @@ from brax.envs.base import Env, State
 from maxent_jax.types import Transition
 
 Tree = TypeVar("Tree")
+__all__ = ["Env", "Episodes", "State", "draw_starts", "finite_rows", "init", "select_rows", "step"]
 
 
 class Episodes(NamedTuple):

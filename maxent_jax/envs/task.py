@@ -90,12 +90,15 @@ class MujocoEnv(Env):
 
     @property
     def observation_size(self) -> int:
+        """D."""
         return jax.eval_shape(self.reset, jax.random.key(0)).obs.shape[-1]
 
     @property
     def action_size(self) -> int:
+        """A."""
         return self.model.nu
 
     @property
     def backend(self) -> str:
+        """What simulates: mjx or mujoco."""
         return self._backend

@@ -1,6 +1,6 @@
 """The SAC learner: init, update, act. Settings come from a Config; sizes from the caller."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -82,7 +82,7 @@ def restart(sac: Sac, parameters: Parameters) -> Agent:
 
 def act(sac: Sac, actor: Any, observation: jax.Array, key: jax.Array) -> jax.Array:
     """An action drawn from the policy: [..., D] -> [..., A] in [-1, 1]."""
-    mean, log_std = sac.actor.apply(actor, sac.inputs(observation))
+    mean, log_std = _policy(sac, actor, sac.inputs(observation))
     return jnp.tanh(mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape))
 
 
@@ -94,12 +94,11 @@ def update(sac: Sac, agent: Agent, batch: losses.Batch, key: jax.Array) -> tuple
     target = _target(sac, parameters, batch, key_next)
 
     def critic_loss(critic):
-        values = lambda x, a: sac.critic.apply(critic, x, a)
-        return losses.critic_loss(values, target, batch, inputs)
+        return losses.critic_loss(_values(sac, critic, inputs, batch.action), target)
 
     def actor_loss(actor):
-        action, log_prob = losses.sample_action(*sac.actor.apply(actor, inputs), key_actor)
-        values = sac.critic.apply(parameters.critic, inputs, action)
+        action, log_prob = losses.sample_action(*_policy(sac, actor, inputs), key_actor)
+        values = _values(sac, parameters.critic, inputs, action)
         temperature = jnp.exp(parameters.log_temperature)
         return losses.actor_loss(log_prob, values, temperature), log_prob
 
@@ -115,9 +114,7 @@ def update(sac: Sac, agent: Agent, batch: losses.Batch, key: jax.Array) -> tuple
     gradients = (actor_gradient, critic_gradient, temperature_gradient)
     steps, optimizer = sac.optimizer.update(gradients, agent.optimizer)
     actor, critic, log_temperature = optax.apply_updates(_learned(parameters), steps)
-    target_critic = optax.incremental_update(
-        critic, parameters.target_critic, sac.soft_update_rate
-    )
+    target_critic = optax.incremental_update(critic, parameters.target_critic, sac.soft_update_rate)
     metrics = {
         "critic_loss": critic_value,
         "actor_loss": actor_value,
@@ -128,10 +125,18 @@ def update(sac: Sac, agent: Agent, batch: losses.Batch, key: jax.Array) -> tuple
     return Agent(Parameters(actor, critic, target_critic, log_temperature), optimizer), metrics
 
 
+def _policy(sac: Sac, actor: Any, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return cast(tuple[jax.Array, jax.Array], sac.actor.apply(actor, inputs))
+
+
+def _values(sac: Sac, critic: Any, inputs: jax.Array, action: jax.Array) -> jax.Array:
+    return cast(jax.Array, sac.critic.apply(critic, inputs, action))
+
+
 def _target(sac: Sac, parameters: Parameters, batch: losses.Batch, key: jax.Array) -> jax.Array:
     inputs = sac.inputs(batch.next_observation)
-    action, log_prob = losses.sample_action(*sac.actor.apply(parameters.actor, inputs), key)
-    values = sac.critic.apply(parameters.target_critic, inputs, action)
+    action, log_prob = losses.sample_action(*_policy(sac, parameters.actor, inputs), key)
+    values = _values(sac, parameters.target_critic, inputs, action)
     next_value = jnp.min(values, axis=-1) - jnp.exp(parameters.log_temperature) * log_prob
     return losses.bellman_target(batch, next_value, sac.discount)
 

@@ -26,9 +26,8 @@ def sample_action(mean: jax.Array, log_std: jax.Array, key: jax.Array):
     return jnp.tanh(raw), jnp.sum(log_gaussian - log_slope, axis=-1)
 
 
-def critic_loss(critic, target, batch: Batch, inputs) -> jax.Array:
-    """Sum over the two critics of the mean squared Bellman error (Eq. 5)."""
-    values = critic(inputs, batch.action)
+def critic_loss(values: jax.Array, target: jax.Array) -> jax.Array:
+    """Sum over the critics [B, 2] of the mean squared error from the target [B] (Eq. 5)."""
     return jnp.mean(jnp.sum((values - target[:, None]) ** 2, axis=-1))
 
 

@@ -15,7 +15,7 @@ class Replay(NamedTuple):
 
 
 def init(item: Any, capacity: int) -> Replay:
-    """An empty ring for items shaped like `item` (arrays or shapes, without a leading axis)."""
+    """An empty ring for items of the shapes and dtypes of `item`, which has no leading axis."""
     items = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), item)
     return Replay(items, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
 
@@ -24,8 +24,10 @@ def add(replay: Replay, items: Any, valid: jax.Array) -> Replay:
     """With the valid rows of `items` [B, ...] inserted, over the oldest once it is full."""
     capacity = _capacity(replay)
     offset = jnp.cumsum(valid, dtype=jnp.int32) - 1
-    rows = jnp.where(valid, (replay.cursor + offset) % capacity, capacity)
     num_added = jnp.sum(valid, dtype=jnp.int32)
+    # Of more rows than places only the last stay: a scatter leaves open which duplicate wins.
+    kept = valid & (offset >= num_added - capacity)
+    rows = jnp.where(kept, (replay.cursor + offset) % capacity, capacity)
     return Replay(
         items=jax.tree.map(lambda x, new: x.at[rows].set(new, mode="drop"), replay.items, items),
         size=jnp.minimum(replay.size + num_added, capacity),

@@ -1,0 +1,208 @@
+"""How many env steps a second does each physics backend make, and its peers?
+
+Ant under random actions, without resets. Ours and bare `mujoco.rollout` start from the same states
+on the ground and take the same actions, so that beside each rate stands how far its motion departs
+from that of C MuJoCo: a solver that stops early is faster, and is not the same environment.
+"""
+
+import functools
+import sys
+import warnings
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from benchmarks import common
+from maxent_jax import envs
+from maxent_jax.envs import physics
+from maxent_jax.envs.task import MujocoEnv
+
+SETTLE_STEPS = 40  # of random actions before a workload starts: 2 s, by which an ant has landed
+MIN_STEPS = DRIFT_STEPS = 50  # of each env
+MUJOCO_STEPS = 6400  # of all envs together, at least; C MuJoCo is too fast for fewer
+SEED = 0
+
+
+class Workload(NamedTuple):
+    """What every implementation is given; the peers with states of their own take the actions."""
+
+    env: MujocoEnv
+    starts: Any  # env states, [N, ...]
+    actions: np.ndarray  # [T, N, A] float32 in [-1, 1]
+
+    @property
+    def num_steps(self) -> int:
+        """Env steps, all envs together."""
+        return self.actions.shape[0] * self.actions.shape[1]
+
+
+class Measurement(NamedTuple):
+    """Of one workload."""
+
+    steps_per_second: float
+    positions: np.ndarray | None  # [T, N, nq] after each control step, where states can be set
+    extra: dict[str, float]  # further columns
+
+
+def make_workload(backend: str, profile: str, num_envs: int, num_steps: int) -> Workload:
+    env, ground = envs.make("ant", backend, profile), envs.make("ant", "mujoco", "reference")
+    random = np.random.default_rng(SEED)
+    shape = (SETTLE_STEPS + num_steps, num_envs, env.action_size)
+    actions = random.uniform(-1, 1, shape).astype(np.float32)
+    starts = jax.vmap(env.reset)(jax.random.split(jax.random.key(SEED), num_envs))
+    starts, _ = jax.jit(functools.partial(scan, ground))(starts, actions[:SETTLE_STEPS])
+    return Workload(env, starts, actions[SETTLE_STEPS:])
+
+
+def scan(env: MujocoEnv, starts: Any, actions: jax.Array) -> tuple[Any, jax.Array]:
+    """The last states, and the observations [T, N, D] after each step."""
+
+    def step(state, action):
+        state = jax.vmap(env.step)(state, action)
+        return state, state.obs
+
+    return jax.lax.scan(step, starts, actions)
+
+
+def ours(workload: Workload, repeats: int) -> Measurement:
+    inputs = workload.starts, jnp.asarray(workload.actions)
+    program, compile_seconds = common.compiled(functools.partial(scan, workload.env), *inputs)
+    seconds = common.median_seconds(lambda: program(*inputs), repeats)
+    positions = np.asarray(program(*inputs)[1])[..., : workload.env.model.nq]
+    extra = {"compile_seconds": compile_seconds}
+    return Measurement(workload.num_steps / seconds, positions, extra)
+
+
+def bare_rollout(workload: Workload, repeats: int) -> Measurement:
+    """C MuJoCo on all cores, of the reference model, all steps known in advance: the ceiling."""
+    task = workload.env.task
+    model = physics.load_model(task.xml, "reference")
+    full = mujoco.mjtState.mjSTATE_FULLPHYSICS
+    starts = np.zeros((workload.actions.shape[1], mujoco.mj_stateSize(model, full)))
+    where_qpos, where_qvel = slice(1, 1 + model.nq), slice(1 + model.nq, 1 + model.nq + model.nv)
+    given = jax.tree.map(np.asarray, workload.starts.pipeline_state)
+    starts[:, where_qpos], starts[:, where_qvel] = given.qpos, given.qvel  # after the time
+    warmstart = given.warmstart.astype(np.float64)
+    # [N, T × frame skip, A]: each control is held for a control step
+    controls = np.repeat(in_control_range(model, workload.actions), task.frame_skip, axis=0)
+    controls = np.ascontiguousarray(controls.swapaxes(0, 1), np.float64)
+    data = [mujoco.MjData(model) for _ in range(common.CORES)]
+    with rollout.Rollout(nthread=common.CORES) as pool:
+        run = lambda: pool.rollout(model, data, starts, controls, initial_warmstart=warmstart)[0]
+        seconds = common.median_seconds(run, repeats)
+        states = run()
+    positions = states[:, task.frame_skip - 1 :: task.frame_skip, where_qpos].swapaxes(0, 1)
+    return Measurement(workload.num_steps / seconds, positions, {})
+
+
+def in_control_range(model: mujoco.MjModel, actions: np.ndarray) -> np.ndarray:
+    low, high = model.actuator_ctrlrange.T
+    return (low + (actions + 1) / 2 * (high - low)).astype(np.float32)
+
+
+def gymnasium_sync(gymnasium, workload: Workload, repeats: int) -> Measurement:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # v4 is what the paper used
+        env = gymnasium.make_vec("Ant-v4", workload.actions.shape[1], vectorization_mode="sync")
+    return stepped(env, workload, repeats)
+
+
+def envpool_threads(envpool, workload: Workload, repeats: int) -> Measurement:
+    num_envs = workload.actions.shape[1]
+    env = envpool.make_gymnasium("Ant-v4", num_envs=num_envs, num_threads=common.CORES)
+    return stepped(env, workload, repeats)
+
+
+def stepped(env, workload: Workload, repeats: int) -> Measurement:
+    """A vector env of Gymnasium's interface, with the episodes and resets that it makes itself."""
+    actions = in_control_range(workload.env.model, workload.actions)
+    env.reset()
+
+    def run():
+        for action in actions:
+            env.step(action)
+
+    rate = workload.num_steps / common.median_seconds(run, repeats)
+    env.close()
+    return Measurement(rate, None, {})
+
+
+PEERS = (
+    common.Peer("gymnasium", "gymnasium", gymnasium_sync),
+    common.Peer("envpool", "envpool", envpool_threads),
+)
+
+
+def fidelity(found: Measurement, truth: Measurement) -> dict[str, float]:
+    """How far the motion lies from that of C MuJoCo, which computes in float64."""
+    if found.positions is None or truth.positions is None or found is truth:
+        return {}
+    departure = found.positions - truth.positions
+    num_steps = min(len(departure), DRIFT_STEPS)
+    torso = departure[num_steps - 1, :, :3]
+    return {
+        "largest_error_after_1_step": float(np.max(np.abs(departure[0]))),
+        "drift_steps": num_steps,
+        "median_drift_metres": float(np.median(np.linalg.norm(torso, axis=-1))),
+    }
+
+
+def measure(cases, peers, repeats: int) -> Iterator[dict[str, Any]]:
+    """Rows for each case (backend, physics, envs, steps), and for the peers at the same sizes."""
+    ceilings: dict[tuple[int, int], Measurement] = {}
+
+    def row(who: str, workload: Workload, found: Measurement, ceiling: Measurement, **more):
+        num_steps, num_envs, _ = workload.actions.shape
+        return common.progress(
+            {
+                "benchmark": "envs",
+                "env": "ant",
+                "who": who,
+                "envs": num_envs,
+                "steps_of_each": num_steps,
+                "env_steps_per_second": found.steps_per_second,
+                "over_bare_rollout": found.steps_per_second / ceiling.steps_per_second,
+                **more,
+                **fidelity(found, ceiling),
+                **found.extra,
+            }
+        )
+
+    for backend, profile, num_envs, num_steps in cases:
+        workload = make_workload(backend, profile, num_envs, num_steps)
+        size = num_envs, num_steps
+        if size not in ceilings:
+            ceilings[size] = bare_rollout(workload, repeats)
+            yield row("mujoco.rollout", workload, ceilings[size], ceilings[size])
+            for peer, module in peers:
+                found = peer.measure(module, workload, repeats)
+                yield row(peer.distribution, workload, found, ceilings[size])
+        found = ours(workload, repeats)
+        yield row("maxent_jax", workload, found, ceilings[size], backend=backend, physics=profile)
+
+
+def main() -> None:
+    flags = common.parser(__doc__)
+    flags.add_argument("--mujoco-envs", type=int, nargs="*", default=[16, 32, 128, 512])
+    flags.add_argument("--mjx-envs", type=int, nargs="*", default=[8, 32])
+    args = flags.parse_args()
+    common.print_versions(PEERS)
+    cases = [
+        ("mujoco", "reference", n, max(MIN_STEPS, MUJOCO_STEPS // n)) for n in args.mujoco_envs
+    ]
+    cases += [("mjx", p, n, MIN_STEPS) for p in physics.PROFILES for n in args.mjx_envs]
+    if args.toy:
+        print("toy: without mjx, which compiles for tens of seconds", file=sys.stderr)
+        cases = [("mujoco", "reference", 4, 4)]
+    rows = list(measure(cases, common.importable(PEERS), args.repeats))
+    for row in rows:
+        common.emit(row)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,184 @@
+"""How many SAC updates a second, what share of the machine's matmul peak is that, and the peers?
+
+Updates run in one scan, each on a batch of its own of Ant's sizes. Peers run their own `train` on
+their own replay, from which they also draw the batches.
+"""
+
+import functools
+import itertools
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import common
+from maxent_jax.config import preset
+from maxent_jax.sac import agent, losses
+
+OBSERVATION_SIZE, ACTION_SIZE = 29, 8  # Ant
+SIZES = ((128, 128), (256, 256))  # hidden units, batch
+NUM_SEEDS = (1, 2)
+NUM_HIDDEN_LAYERS = 2
+NUM_UPDATES = 200
+PEAK_SIZE = 2048
+
+
+def peak_flops(size: int, repeats: int) -> float:
+    """FLOP/s of one square float32 matmul at the precision that the networks' layers have."""
+    a = jnp.ones((size, size))
+    product, _ = common.compiled(jnp.matmul, a, a)
+    return 2 * size**3 / common.median_seconds(lambda: product(a, a), repeats)
+
+
+def update_flops(hidden_size: int, batch_size: int) -> float:
+    """Of the matmuls that one update cannot do without.
+
+    A layer of m inputs and n outputs costs 2 m n a row forward, as much again for the gradient of
+    its weights, and as much for that of its inputs, which a first layer is not asked for. XLA's own
+    count, of everything, is 5 % higher for 128 units and a batch of 128, 3 % for 256 and 256.
+    """
+
+    def forward(num_inputs, num_outputs):
+        widths = [num_inputs, *[hidden_size] * NUM_HIDDEN_LAYERS, num_outputs]
+        layers = [2 * m * n for m, n in itertools.pairwise(widths)]
+        return sum(layers), layers[0]
+
+    actor, actor_first = forward(OBSERVATION_SIZE, 2 * ACTION_SIZE)
+    critic, critic_first = forward(OBSERVATION_SIZE + ACTION_SIZE, 1)
+    observation_share = OBSERVATION_SIZE / (OBSERVATION_SIZE + ACTION_SIZE)
+    target = actor + 2 * critic
+    critic_step = 2 * (3 * critic - critic_first)
+    # Through both critics to the action: no gradient of their weights, none of the observation.
+    through_critics = 2 * (2 * critic - critic_first * observation_share)
+    actor_step = 3 * actor - actor_first + through_critics
+    return float(batch_size * (target + critic_step + actor_step))
+
+
+def ours(
+    hidden_size: int, batch_size: int, layer_norm: bool, num_seeds: int, num_updates: int, repeats
+) -> tuple[float, float]:
+    """Updates a second, all seeds together, and seconds to compile."""
+    config = preset(
+        "paper",
+        hidden_layers=NUM_HIDDEN_LAYERS,
+        hidden_size=hidden_size,
+        batch_size=batch_size,
+        critic_layer_norm=layer_norm,
+    )
+    sac = agent.make(config, OBSERVATION_SIZE, ACTION_SIZE, lambda observation: observation)
+    key_init, key_batches, key_updates = jax.random.split(jax.random.key(0), 3)
+    lead = (num_seeds, num_updates, batch_size)
+    columns = [(OBSERVATION_SIZE,), (ACTION_SIZE,), (), (OBSERVATION_SIZE,), ()]
+    keys = jax.random.split(key_batches, len(columns))
+    batches = losses.Batch(
+        *(
+            jax.random.uniform(key, lead + column, minval=-1.0, maxval=1.0)
+            for key, column in zip(keys, columns, strict=True)
+        )
+    )
+    learners = jax.jit(jax.vmap(functools.partial(agent.init, sac)))(
+        jax.random.split(key_init, num_seeds)
+    )
+    inputs = batches, jax.random.split(key_updates, lead[:2])
+
+    def run(learner, inputs):
+        update = lambda learner, x: (agent.update(sac, learner, *x)[0], None)
+        return jax.lax.scan(update, learner, inputs)[0]
+
+    if num_seeds == 1:  # no axis of seeds, as in training
+        learners, inputs = jax.tree.map(lambda x: x[0], (learners, inputs))
+        program, compile_seconds = common.compiled(run, learners, inputs)
+    else:
+        program, compile_seconds = common.compiled(jax.vmap(run), learners, inputs)
+    seconds = common.median_seconds(lambda: program(learners, inputs), repeats)
+    return num_seeds * num_updates / seconds, compile_seconds
+
+
+class Noise(gymnasium.Env):
+    """Nothing but spaces of Ant's sizes, from which a peer makes its networks."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+
+
+def baselines(module, hidden_size: int, batch_size: int, num_updates: int, repeats: int) -> float:
+    """Updates a second of stable-baselines3 or of sbx, which has the same interface."""
+    from stable_baselines3.common import logger
+
+    model = module.SAC(
+        "MlpPolicy",
+        Noise(),
+        batch_size=batch_size,
+        buffer_size=10_000,
+        policy_kwargs={"net_arch": [hidden_size] * NUM_HIDDEN_LAYERS},
+        device="cpu",
+    )
+    model.set_logger(logger.configure(None, []))
+    random = np.random.default_rng(0)
+    for _ in range(1000):
+        observation, following = random.standard_normal((2, 1, OBSERVATION_SIZE), np.float32)
+        action = random.uniform(-1, 1, (1, ACTION_SIZE))
+        reward, done = random.standard_normal(1), np.zeros(1)
+        model.replay_buffer.add(observation, following, action, reward, done, [{}])
+    run = lambda: model.train(gradient_steps=num_updates, batch_size=batch_size)
+    return num_updates / common.median_seconds(run, repeats)
+
+
+PEERS = (
+    common.Peer("sbx-rl", "sbx", baselines),
+    common.Peer("stable-baselines3", "stable_baselines3", baselines),
+)
+
+
+def measure(
+    size: tuple[int, int], num_updates: int, peak: float, peers, repeats: int
+) -> Iterator[dict[str, Any]]:
+    """Rows for one size; ratios are to one seed of ours without layer norm, measured first."""
+    hidden_size, batch_size = size
+    rates: list[float] = []
+
+    def row(who: str, updates: float, **more):
+        rates.append(updates)
+        return common.progress(
+            {
+                "benchmark": "sac",
+                "who": who,
+                "hidden_size": hidden_size,
+                "batch_size": batch_size,
+                "updates_per_second": updates,
+                "samples_per_second": updates * batch_size,
+                "share_of_matmul_peak": updates * update_flops(hidden_size, batch_size) / peak,
+                "ours_over_this": rates[0] / updates,
+                **more,
+            }
+        )
+
+    for layer_norm, num_seeds in itertools.product((False, True), NUM_SEEDS):
+        updates, compile_seconds = ours(
+            hidden_size, batch_size, layer_norm, num_seeds, num_updates, repeats
+        )
+        more = {"layer_norm": layer_norm, "seeds": num_seeds, "compile_seconds": compile_seconds}
+        yield row("maxent_jax", updates, **more)
+    for peer, module in peers:
+        updates = peer.measure(module, hidden_size, batch_size, num_updates, repeats)
+        yield row(peer.distribution, updates, layer_norm=False, seeds=1)
+
+
+def main() -> None:
+    args = common.parser(__doc__).parse_args()
+    common.print_versions(PEERS)
+    sizes, num_updates = (((16, 8),), 4) if args.toy else (SIZES, NUM_UPDATES)
+    peak = peak_flops(256 if args.toy else PEAK_SIZE, args.repeats)
+    rows = [common.progress({"benchmark": "sac", "who": "matmul", "gflop_per_second": peak / 1e9})]
+    peers = common.importable(PEERS)
+    for size in sizes:
+        rows += measure(size, num_updates, peak, peers, args.repeats)
+    for row in rows:
+        common.emit(row)
+
+
+if __name__ == "__main__":
+    main()

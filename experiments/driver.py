@@ -1,0 +1,161 @@
+"""Runs the three programs of an iteration, and logs, saves and draws in between."""
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from maxent_jax import algorithm, checkpoint, methods, plotting, runs
+from maxent_jax.algorithm import Programs, State
+from maxent_jax.analysis import load_run
+from maxent_jax.cache import enable_compilation_cache
+from maxent_jax.config import Config
+from maxent_jax.density import histogram
+
+
+def train(config: Config, directory: Path, process_started: float) -> None:
+    """Trains to the end, from the last complete checkpoint if there is one.
+
+    Args:
+      process_started: time.perf_counter() when the program began, for the time to the first step.
+    """
+    enable_compilation_cache()
+    directory.mkdir(parents=True, exist_ok=True)
+    completed = checkpoint.latest_step(directory) or 0
+    if completed == config.num_iterations:
+        print(f"{directory} is complete: nothing to do.")
+        return
+    if completed:
+        state = checkpoint.restore(directory, config)
+    else:
+        runs.write_config(directory, config, methods.row(config)._asdict())
+        state = algorithm.start(config)
+    rows = runs.truncate_metrics(directory, completed)
+    clock = _Clock(process_started, rows[-1] if rows else {})
+    programs = algorithm.programs(config)
+    with _Bar(config, completed) as bar:
+        for _ in range(completed, config.num_iterations):
+            state, row = _iterate(config, programs, state, clock, bar)
+            runs.append_metrics(directory, row)
+            checkpoint.save(directory, state)
+    _draw(directory)
+    _summarise(directory, rows=runs.read_metrics(directory))
+
+
+def _iterate(
+    config: Config, programs: Programs, state: State, clock: "_Clock", bar: "_Bar"
+) -> tuple[State, dict[str, Any]]:
+    """algorithm.iterate, with the clock read and the bar moved between its parts."""
+    state, at_begin = clock.time("wall_begin", programs.begin, state)
+    segments = []
+    for _ in range(config.num_segments):
+        state, metrics = clock.time("wall_train", programs.train_segment, state)
+        segments.append(metrics)
+        clock.first_step_done()
+        bar.advance(metrics)
+    state, at_end = clock.time("wall_end", programs.end, state)
+    stacked = jax.tree.map(lambda *x: np.stack(x), *segments)
+    row = {**at_end, **at_begin, **algorithm.reduce_metrics(stacked), **clock.row()}
+    bar.iteration_done(row)
+    return state, row
+
+
+class _Clock:
+    """Seconds spent, through interruptions: a resumed run goes on from its last row."""
+
+    def __init__(self, process_started: float, last_row: dict[str, Any]):
+        self._origin = process_started - last_row.get("wall_seconds", 0.0)
+        self._process_started = process_started
+        self._first_step: float | None = last_row.get("wall_first_step")
+        self._train_total = last_row.get("wall_train_total", 0.0)
+        self._parts: dict[str, float] = {}
+
+    def time(self, part: str, program, state: State):
+        started = time.perf_counter()
+        state, metrics = jax.block_until_ready(program(state))
+        seconds = time.perf_counter() - started
+        self._parts[part] = self._parts.get(part, 0.0) + seconds
+        return state, jax.tree.map(np.asarray, metrics)
+
+    def first_step_done(self) -> None:
+        if self._first_step is None:
+            self._first_step = time.perf_counter() - self._process_started
+
+    def row(self) -> dict[str, float | None]:
+        """The columns of the iteration just ended; the parts start again at 0."""
+        self._train_total += self._parts["wall_train"]
+        parts, self._parts = self._parts, {}
+        now = time.perf_counter()
+        return {
+            "wall_seconds": now - self._origin,
+            "wall_first_step": self._first_step,  # to the end of the first segment
+            "wall_train_total": self._train_total,
+            **parts,
+        }
+
+
+class _Bar:
+    """A progress line on standard error; nothing where that is not a terminal."""
+
+    def __init__(self, config: Config, completed: int):
+        console = Console(stderr=True)
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[status]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._iteration, self._coverage = completed, ""
+        self._num_iterations = config.num_iterations
+        self._task = self._progress.add_task(
+            "",
+            total=config.num_iterations * config.num_segments,
+            completed=completed * config.num_segments,
+            status="compiling",
+        )
+
+    def __enter__(self) -> "_Bar":
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def advance(self, metrics: dict[str, Any]) -> None:
+        reward = float(np.mean(metrics["replay_reward"]))
+        self._progress.update(
+            self._task,
+            advance=1,
+            description=f"iteration {self._iteration + 1}/{self._num_iterations}",
+            status=f"reward {reward:.3f}{self._coverage}",
+        )
+
+    def iteration_done(self, row: dict[str, Any]) -> None:
+        self._iteration += 1
+        self._coverage = f" · {int(np.mean(row['cumulative_coverage'])):,} cells"
+
+
+def _draw(directory: Path) -> None:
+    run = load_run(directory)
+    visited = run.occupancy()
+    cells = histogram.count(visited.states, run.parts.env.task.grid, visited.weight)
+    plotting.save_all(run, np.asarray(cells), run.rollout(episodes_per_policy=5))
+
+
+def _summarise(directory: Path, rows: list[dict[str, Any]]) -> None:
+    last = rows[-1]
+    print(
+        f"{directory}: {np.mean(last['cumulative_coverage']):,.0f} cells visited in training "
+        f"({np.mean(last.get('random_coverage', np.nan)):,.0f} by a random policy), "
+        f"{np.mean(last['mixture_coverage']):,.0f} by the mixture, "
+        f"{last['wall_seconds']:,.0f} s; figures in {directory / runs.FIGURES}."
+    )
+    sys.stdout.flush()

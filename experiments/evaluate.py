@@ -1,0 +1,97 @@
+"""Loads a run, rolls its mixture out anew, and reports what it covers.
+
+Prints a table and writes evaluation.json and figures/ into the run's directory.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from experiments import cli
+from maxent_jax import runs
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Evaluate a run: entropy, coverage, and the returns of each policy."""
+
+    directory: Annotated[Path, tyro.conf.Positional]
+    """The run's directory."""
+    episodes: int = 5
+    """Episodes of each policy."""
+    seed: int = 1
+    """Of the rollouts; training evaluates with 0."""
+    seed_index: int = 0
+    """Which of the seeds trained side by side."""
+
+
+def main(argv: Sequence[str]) -> None:
+    """Parses and checks, and only then loads jax."""
+    arguments = cli.parse(Arguments, argv)
+    if arguments.episodes < 1 or arguments.seed < 0:
+        raise cli.UsageError("--episodes must be at least 1, and --seed 0 or more.")
+    runs.read_config(arguments.directory)
+    from maxent_jax.cache import enable_compilation_cache
+
+    enable_compilation_cache()
+    report = evaluate(arguments)
+    runs.write_json(arguments.directory / "evaluation.json", report)
+    _print(report)
+
+
+def evaluate(arguments: Arguments) -> dict[str, Any]:
+    """The report, JSON-ready; the figures are drawn on the way."""
+    import jax.numpy as jnp
+    import numpy as np
+
+    from maxent_jax import analysis, plotting
+    from maxent_jax.density import histogram
+
+    run = analysis.load_run(arguments.directory, arguments.seed_index)
+    visited = run.occupancy(arguments.seed)
+    cells = histogram.count(visited.states, run.parts.env.task.grid, visited.weight)
+    paths = run.rollout(arguments.episodes, arguments.seed)
+    scores = run.scores(visited, arguments.seed)
+    plotting.save_all(run, np.asarray(cells), paths)
+    ends = analysis.mean_ends(run, paths)
+    policies = [
+        {
+            "policy": i,
+            "weight": float(run.weights[i]),
+            "episode_return": float(scores.episode_return[i]),
+            "step_reward": float(scores.step_reward[i]),
+            "episode_length": float(paths.alive[paths.policy == i].sum(1).mean()),
+            "end_distance": float(np.hypot(*ends[i])),
+            "end_direction": float(np.degrees(np.arctan2(ends[i][1], ends[i][0]))),
+        }
+        for i in range(run.num_policies)
+    ]
+    return {
+        "run": str(run.path),
+        "policies": policies,
+        "training_coverage": int((run.histogram > 0).sum()),
+        "training_entropy": float(histogram.shannon_entropy(jnp.asarray(run.histogram))),
+        "random_coverage": int((run.random_histogram > 0).sum()),
+        **run.measures(visited, arguments.seed),
+    }
+
+
+def _print(report: dict[str, Any]) -> None:
+    policies = report["policies"]
+    print("policy  weight   return  reward/step  length  mean end (m)  direction (deg)")
+    for p in policies:
+        print(
+            f"{p['policy']:6d}  {p['weight']:6.3f}  {p['episode_return']:7.1f}"
+            f"  {p['step_reward']:11.3f}  {p['episode_length']:6.0f}"
+            f"  {p['end_distance']:12.1f}  {p['end_direction']:15.0f}"
+        )
+    for name, value in report.items():
+        if isinstance(value, int | float):
+            print(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value:,}")
+
+
+if __name__ == "__main__":
+    cli.entry_point(main)()

@@ -1,0 +1,155 @@
+"""A finished or running run, loaded to be looked at."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from maxent_jax import checkpoint, methods, mixture, occupancy, parts, runs
+from maxent_jax.config import Config
+from maxent_jax.envs import base
+from maxent_jax.mixture import Archive
+from maxent_jax.occupancy import Occupancy, Scores
+from maxent_jax.parts import Parts
+from maxent_jax.sac import agent
+
+
+class Paths(NamedTuple):
+    """Episodes of single policies."""
+
+    states: np.ndarray  # [E, T, D]
+    alive: np.ndarray  # [E, T] bool: the state was reached before the episode's end
+    policy: np.ndarray  # [E] int, ascending
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """One seed of a run. `metrics` are columns with one entry an iteration, [T] or [T, ...]."""
+
+    path: Path
+    config: Config
+    metrics: dict[str, np.ndarray]
+    mixture: Archive
+    histogram: np.ndarray  # [bins, bins] states met in training
+    random_histogram: np.ndarray  # [bins, bins] states met by the random policy beside it
+
+    @property
+    def num_policies(self) -> int:
+        """Policies in the mixture, the untrained one included."""
+        return int(self.mixture.size)
+
+    @property
+    def weights(self) -> np.ndarray:
+        """[P] of the mixture's policies, 0 for empty slots."""
+        return np.asarray(methods.make(self.config).weights[self.num_policies - 1])
+
+    @property
+    def parts(self) -> Parts:
+        """The environment, the networks and the feature map of the run."""
+        return parts.make(self.config)
+
+    def policy(self, index: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
+        """Policy `index` as a function: state [..., D], key -> action [..., A] in [-1, 1].
+
+        Raises:
+          IndexError: no such policy.
+        """
+        if not -self.num_policies <= index < self.num_policies:
+            raise IndexError(f"policy {index} of a mixture of {self.num_policies}")
+        slot = jnp.asarray(index % self.num_policies)
+        actor = mixture.policy(self.mixture, slot).actor
+        return functools.partial(agent.act, self.parts.sac, actor)
+
+    def act(self, s: jax.Array, key: jax.Array, policy: int | None = None) -> jax.Array:
+        """Actions [..., A] for states [..., D] by one policy, drawn by weight unless named."""
+        key_draw, key_act = jax.random.split(key)
+        if policy is None:
+            policy = int(jax.random.choice(key_draw, self.weights.shape[0], p=self.weights))
+        return self.policy(policy)(s, key_act)
+
+    def rollout(self, episodes_per_policy: int, seed: int = 0) -> Paths:
+        """Fresh episodes of each policy."""
+        key_starts, key_play = jax.random.split(jax.random.key(seed))
+        who = jnp.repeat(jnp.arange(self.num_policies), episodes_per_policy)
+        starts = self._starts(len(who), key_starts)
+        played = jax.jit(functools.partial(occupancy.play, self.parts))(
+            self.mixture, who, starts, key_play
+        )
+        return Paths(
+            np.moveaxis(np.asarray(played.states), 0, 1),
+            np.asarray(played.alive).T,
+            np.asarray(who),
+        )
+
+    def occupancy(self, seed: int = 0) -> Occupancy:
+        """Fresh episodes of the mixture, with each state's share of its occupancy."""
+        key_starts, key_play = jax.random.split(jax.random.key(seed))
+        starts = self._starts(self.config.mixture_episodes, key_starts)
+        roll = jax.jit(functools.partial(occupancy.of_mixture, self.parts))
+        return roll(self.mixture, jnp.asarray(self.weights), starts, key_play)
+
+    def scores(self, visited: Occupancy, seed: int = 0) -> Scores:
+        """Each policy's return under the reward that these states of the mixture define."""
+        key, size = jax.random.key(seed), self.config.reference_size
+        rows = mixture.draw_rows(visited.weight, size, key)
+        score = jax.jit(functools.partial(occupancy.score, self.parts))
+        return score(visited, visited.features[rows], rows, self.mixture)
+
+    def measures(self, visited: Occupancy, seed: int = 0) -> dict[str, float]:
+        """Coverage and entropies of the mixture, named as in the metrics."""
+        measured = occupancy.measures(self.parts, visited, jax.random.key(seed))
+        return {name: value.item() for name, value in measured.items()}
+
+    def _starts(self, num: int, key: jax.Array) -> base.State:
+        return jax.vmap(self.parts.env.reset)(jax.random.split(key, num))
+
+
+def load_run(path: str | Path, seed_index: int = 0) -> Run:
+    """Loads the results of a run; the replay stays on disk.
+
+    Args:
+      path: the run's directory.
+      seed_index: which of the seeds that were trained side by side.
+    Raises:
+      RunError: not the directory of a run, or no such seed.
+      CheckpointError: no complete checkpoint.
+    """
+    directory = Path(path)
+    config = runs.read_config(directory)
+    if not 0 <= seed_index < config.num_seeds:
+        raise runs.RunError(f"{directory} has {config.num_seeds} seeds: no index {seed_index}.")
+    results = checkpoint.restore_results(directory, config)
+    rows = runs.read_metrics(directory)
+    if config.num_seeds > 1:
+        results = jax.tree.map(lambda x: x[seed_index], results)
+        rows = [_of_seed(row, seed_index) for row in rows]
+    return Run(
+        path=directory,
+        config=config,
+        metrics={name: _column(rows, name) for name in rows[0]} if rows else {},
+        mixture=results.archive,
+        histogram=np.asarray(results.visits.cells),
+        random_histogram=np.asarray(results.random_visits.cells),
+    )
+
+
+def mean_ends(run: Run, paths: Paths) -> np.ndarray:
+    """[P, 2] metres: the mean of where the episodes of each policy end, on the grid's axes."""
+    last = paths.alive.sum(axis=1) - 1
+    ends = paths.states[np.arange(len(last)), np.maximum(last, 0)]
+    ends = ends[:, list(run.parts.env.task.grid.coordinates)]
+    return np.stack([ends[paths.policy == i].mean(axis=0) for i in range(run.num_policies)])
+
+
+def _of_seed(row: dict[str, Any], index: int) -> dict[str, Any]:
+    return {k: v[index] if isinstance(v, list) else v for k, v in row.items()}
+
+
+def _column(rows: list[dict[str, Any]], name: str) -> np.ndarray:
+    values = np.array([row.get(name) for row in rows])
+    return values.astype(float) if values.dtype == object else values

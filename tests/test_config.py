@@ -1,0 +1,65 @@
+"""Values that no run can have are refused in one sentence, before anything is loaded."""
+
+import pytest
+
+from maxent_jax.config import PRESETS, Config, ConfigError, preset
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_are_valid_and_survive_a_round_trip(name):
+    import dataclasses
+
+    config = preset(name)
+    assert Config(**dataclasses.asdict(config)) == config
+    assert hash(config) == hash(preset(name))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (dict(env="antt"), "did you mean 'ant'"),
+        (dict(method="x"), "choose one of h, la, v"),
+        (dict(backend="mujocoo"), "did you mean 'mujoco'"),
+        (dict(backend="warp"), "not part of this release"),
+        (dict(reward="log2"), "did you mean 'log'"),
+        (dict(num_envs=-1), "num-envs is -1, but must be at least 1"),
+        (dict(num_iterations=0), "at least 1"),
+        (dict(learning_rate=0.0), "a positive number"),
+        (dict(learning_rate=float("nan")), "a positive number"),
+        (dict(discount=1.5), "at most 1"),
+        (dict(eta=0.0), "a positive number"),
+        (dict(eta=1.5), "at most 1"),
+        (dict(seed=-1), "0 or more"),
+        (dict(refresh_period=-2), "-1, 0 or more"),
+        (dict(num_neighbors=256), "below reference-size"),
+        (dict(batch_size=2_001), "must not exceed replay-size"),
+        (dict(steps_per_iteration=401), "a multiple of num-envs × num-segments = 8"),
+        (dict(updates_per_step=0.3), "a whole number"),
+        (dict(updates_per_step=1e-9), "a whole number"),
+        (dict(mixture_episodes=2), "each of the 3 policies"),
+        (dict(reference_size=801), "at most 800 states"),
+        (dict(num_envs=400, num_segments=1, replay_size=399), "adds 400"),
+    ],
+)
+def test_a_bad_value_is_refused_by_name(changes, words):
+    with pytest.raises(ConfigError, match=words) as error:
+        preset("smoke", **changes)
+    assert "\n" not in str(error.value)
+
+
+def test_an_unknown_preset_names_the_nearest():
+    with pytest.raises(ConfigError, match="did you mean 'quick'"):
+        preset("quik")
+
+
+def test_quick_names_its_deviations_and_paper_has_none():
+    assert preset("paper").deviations() == {}
+    named = preset("quick").deviations()
+    assert {"torque_limit", "end_flipped", "shaping", "yaw_copies", "reward"} <= set(named)
+
+
+def test_configs_of_all_methods_share_one_program():
+    base = preset("smoke")
+    for changes in (dict(method="h"), dict(seed=3), dict(refresh_period=5), dict(eta=0.01)):
+        assert preset("smoke", **changes).program() == base.program()
+    assert preset("smoke", num_envs=8).program() != base.program()

@@ -1,0 +1,64 @@
+"""Data flows one way: imports point backwards only, and bad input is met before jax is loaded."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent.parent / "maxent_jax"
+# The reading order of the package, first to last.
+ORDER = [
+    *("types", "config", "runs", "cache"),
+    *("density.histogram", "density.knn", "density.entropy", "density.reservoir"),
+    *("envs.physics", "envs.task", "envs.ant", "envs", "envs.base", "rollout", "features"),
+    *("rewards", "sac.networks", "sac.replay", "sac.losses", "sac.agent", "mixture", "methods"),
+    *("parts", "occupancy", "training", "algorithm", "checkpoint", "analysis", "plotting"),
+]
+
+
+def module_name(path):
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(p for p in parts if p != "__init__")
+
+
+def imported(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("maxent_jax"):
+            prefix = node.module.removeprefix("maxent_jax").lstrip(".")
+            for alias in node.names:
+                name = f"{prefix}.{alias.name}".lstrip(".")
+                yield name if name in ORDER else prefix
+
+
+@pytest.mark.parametrize("name", ORDER)
+def test_a_module_imports_only_what_stands_before_it(name):
+    path = PACKAGE / (name.replace(".", "/") + ".py")
+    path = path if path.exists() else PACKAGE / name / "__init__.py"
+    later = {m for m in imported(path) if m and ORDER.index(m) >= ORDER.index(name)}
+    assert not later
+
+
+def test_every_module_has_its_place_in_the_order():
+    found = {module_name(path) for path in PACKAGE.rglob("*.py")} - {"", "density", "sac"}
+    assert found == set(ORDER)
+
+
+def test_the_command_line_is_checked_without_jax():
+    code = (
+        "import sys; from experiments import train, evaluate\n"
+        "train.read_arguments(['--preset', 'smoke', '--out', 'nowhere'])\n"
+        "sys.exit('jax' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_no_unsafe_loading_anywhere():
+    root = PACKAGE.parent
+    for folder in ("maxent_jax", "experiments", "benchmarks"):
+        for path in (root / folder).rglob("*.py"):
+            tree = ast.parse(path.read_text())
+            names = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
+            names |= {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+            assert not names & {"eval", "exec", "pickle", "allow_pickle"}, path

@@ -1,0 +1,252 @@
+"""The command line, end to end at toy size: files, resume, analysis, mistakes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import maxent_jax
+from experiments import driver
+from maxent_jax import checkpoint, runs
+from maxent_jax.config import preset
+
+ROOT = Path(__file__).parent.parent
+TINY = ("--preset", "smoke", "--num-segments", "1", "--mixture-episodes", "6")
+
+
+def command(module, *arguments):
+    return [sys.executable, "-m", module, *map(str, arguments)]
+
+
+def call(module, *arguments, expect=0):
+    done = subprocess.run(
+        command(module, *arguments), cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == expect, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("runs") / "v"
+    call("experiments.train", "--preset", "smoke", "--out", directory)
+    return directory
+
+
+def test_a_run_leaves_its_files(finished):
+    names = {str(p.relative_to(finished)) for p in finished.rglob("*") if p.is_file()}
+    figures = {f"figures/{name}.png" for name in ("curves", "occupancy", "fireworks")}
+    assert {"config.json", "metrics.jsonl"} | figures <= names
+    assert not [name for name in names if "tmp" in name]
+    content = json.loads((finished / "config.json").read_text())
+    assert content["method"] == {
+        "weights": "uniform",
+        "refresh_period": 0,
+        "reference": "mixture",
+        "start": "best",
+    }
+    assert content["deviations_from_the_paper"]["reward"]["value"] == "log1p"
+    assert content["budget"] == {"env_steps": 800, "gradient_steps": 200}
+
+
+def test_metrics_hold_one_line_an_iteration_and_mark_the_clock(finished):
+    rows = runs.read_metrics(finished)
+    assert [row["iteration"] for row in rows] == [1, 2]
+    assert [row["env_steps"] for row in rows] == [400, 800]
+    assert all(0 < row["wall_begin"] < row["wall_seconds"] for row in rows)
+    assert rows[0]["wall_seconds"] < rows[1]["wall_seconds"]
+    for name in ("cumulative", "random", "mixture"):
+        assert all(row[f"{name}_coverage"] >= 1 for row in rows)
+
+
+def test_a_run_loads_for_analysis(finished):
+    run = maxent_jax.load_run(finished)
+    assert run.config == preset("smoke")
+    assert run.num_policies == 3
+    np.testing.assert_allclose(run.weights, 1 / 3, rtol=1e-6)
+    assert run.histogram.sum() == 800
+    assert run.metrics["cumulative_coverage"][-1] == (run.histogram > 0).sum()
+    state, key = jax.numpy.zeros((5, 29)).at[:, 3].set(1.0), jax.random.key(0)
+    actions = [run.policy(i)(state, key) for i in range(3)]
+    assert all(a.shape == (5, 8) and (np.abs(a) <= 1).all() for a in actions)
+    assert not np.allclose(actions[0], actions[2])
+    assert run.act(state, key).shape == (5, 8)
+    paths = run.rollout(episodes_per_policy=2)
+    assert paths.states.shape == (6, 100, 29)
+    assert paths.policy.tolist() == [0, 0, 1, 1, 2, 2]
+    assert (paths.alive.sum(1) >= 1).all()
+    with pytest.raises(IndexError):
+        run.policy(3)
+
+
+def test_evaluate_reports_each_policy(finished):
+    printed = call("experiments.evaluate", finished, "--episodes", 1).stdout
+    report = json.loads((finished / "evaluation.json").read_text())
+    assert len(report["policies"]) == 3
+    assert report["training_coverage"] == (maxent_jax.load_run(finished).histogram > 0).sum()
+    assert "mixture_coverage" in printed and len(printed.splitlines()) > 4
+
+
+def test_resuming_a_finished_run_changes_nothing(finished):
+    def contents():
+        return {p: p.stat().st_mtime_ns for p in finished.rglob("*") if p.is_file()}
+
+    before = contents()
+    done = call("experiments.train", "--preset", "smoke", "--out", finished, "--resume")
+    assert "complete" in done.stdout
+    assert contents() == before
+
+
+def test_a_killed_run_resumes_to_the_end(tmp_path):
+    directory = tmp_path / "killed"
+    line = command("experiments.train", *TINY, "--num-iterations", 5, "--out", directory)
+    quiet = dict(cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(line, **quiet)
+    deadline = time.monotonic() + 240
+    while checkpoint.latest_step(directory) is None:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    reached = checkpoint.latest_step(directory)
+    assert reached is not None and reached < 5, "the run must be killed before its end"
+    done = subprocess.run(
+        [*line, "--resume"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    rows = runs.read_metrics(directory)
+    assert [row["iteration"] for row in rows] == [1, 2, 3, 4, 5]
+    assert [row["env_steps"] for row in rows] == [400, 800, 1200, 1600, 2000]
+    assert np.diff([row["cumulative_coverage"] for row in rows]).min() >= 0
+    assert np.diff([row["wall_seconds"] for row in rows]).min() > 0
+
+
+def test_resume_without_a_checkpoint_starts_over(tmp_path):
+    directory = tmp_path / "early"
+    directory.mkdir()
+    runs.write_config(directory, preset("smoke", num_iterations=1), {})
+    (directory / "metrics.jsonl").write_text('{"iteration": 1}\n{"itera')
+    call(
+        *("experiments.train", "--preset", "smoke", "--num-iterations", 1),
+        *("--out", directory, "--resume"),
+    )
+    assert [row["env_steps"] for row in runs.read_metrics(directory)] == [400]
+
+
+def test_several_seeds_train_side_by_side(tmp_path):
+    directory = tmp_path / "seeds"
+    config = preset("smoke", num_iterations=1, num_segments=1, num_seeds=2)
+    driver.train(config, directory, time.perf_counter())
+    (row,) = runs.read_metrics(directory)
+    assert row["env_steps"] == [400, 400]
+    loaded = [maxent_jax.load_run(directory, seed_index=i) for i in range(2)]
+    assert [run.histogram.sum() for run in loaded] == [400, 400]
+    assert not np.array_equal(loaded[0].histogram, loaded[1].histogram)
+    with pytest.raises(runs.RunError, match="2 seeds"):
+        maxent_jax.load_run(directory, seed_index=2)
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "mjx"])
+@pytest.mark.parametrize(
+    ("method", "period"), [("h", -1), ("la", 1), ("la", 10), ("la", 0), ("v", -1)]
+)
+def test_every_method_runs_on_both_backends(tmp_path, backend, method, period):
+    directory = tmp_path / "run"
+    config = preset("smoke", backend=backend, method=method, refresh_period=period)
+    driver.train(config, directory, time.perf_counter())  # in this process: compiled once
+    assert [row["env_steps"] for row in runs.read_metrics(directory)] == [400, 800]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--env", "antt"), "did you mean 'ant'"),
+        (("--method", "w"), "unknown method 'w'"),
+        (("--preset", "quik"), "did you mean 'quick'"),
+        (("--presett", "quick"), "did you mean --preset"),
+        (("--num-envs", "-3"), "num-envs is -3"),
+        (("--num-envs", "many"), "--num-envs"),
+        (("--num-iterations",), "--num-iterations"),
+        (("--preset", "smoke", "--num-neighbors", "256"), "below reference-size = 256"),
+        (("--preset", "smoke", "--batch-size", "4000"), "must not exceed replay-size"),
+        (("--backend", "warp"), "not part of this release"),
+        (("--out", "tests"), "already exists"),
+        (("--out", "tests", "--resume"), "not the directory of a run"),
+        (("--out", "README.md"), "already exists"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_exit_code_2(arguments, words):
+    started = time.monotonic()
+    done = call("experiments.train", *arguments, expect=2)
+    assert time.monotonic() - started < 5  # nothing was compiled
+    assert words in done.stderr and done.stdout == ""
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+
+
+def test_resume_with_other_settings_names_them(finished):
+    line = ("experiments.train", "--preset", "smoke", "--out", finished, "--resume")
+    done = call(*line, "--learning-rate", "0.5", expect=2)
+    assert "learning_rate was 0.0003 and is 0.5" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda d: (d / "config.json").unlink(),
+        lambda d: (d / "config.json").write_text("{"),
+        lambda d: (d / "config.json").write_text('{"schema": 99, "config": {}}'),
+        lambda d: (d / "config.json").write_text('{"schema": 1, "config": {"no_such": 1}}'),
+    ],
+)
+def test_evaluate_refuses_a_directory_that_is_no_run(tmp_path, damage):
+    runs.write_config(tmp_path, preset("smoke"), {})
+    damage(tmp_path)
+    done = call("experiments.evaluate", tmp_path, expect=2)
+    assert done.stderr.count("\n") == 1 and str(tmp_path) in done.stderr
+
+
+def test_evaluate_says_when_there_is_no_checkpoint(tmp_path):
+    runs.write_config(tmp_path, preset("smoke"), {})
+    assert "no complete checkpoint" in call("experiments.evaluate", tmp_path, expect=2).stderr
+
+
+@pytest.mark.parametrize("module", ["knn", "envs", "sac", "forward_velocity"])
+def test_a_benchmark_ends_with_json_rows(module):
+    printed = call(f"benchmarks.{module}", "--toy").stdout.splitlines()
+    assert printed[0].startswith("# python")
+    assert json.loads(printed[-1])["benchmark"] == module
+
+
+def test_the_feature_table_is_what_its_script_measures():
+    from experiments import measure_features
+    from maxent_jax import features
+
+    table = measure_features.measure("ant")
+    shipped = features.make_feature_map("ant")
+    # contacts are chaotic over 10,000 random steps: another CPU may reach other extremes
+    np.testing.assert_allclose(table["projection"], shipped.projection, rtol=0.3)
+    assert tuple(table["names"]) == shipped.names
+
+
+def test_the_cache_folder_is_the_users_own(monkeypatch):
+    environment = os.environ | {"XDG_CACHE_HOME": "elsewhere"}
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    code = (
+        "import jax; from maxent_jax.cache import enable_compilation_cache as f; f();"
+        "print(jax.config.jax_compilation_cache_dir)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert Path(done.stdout.strip()) == Path("elsewhere", "maxent_jax", "jax")
