@@ -79,7 +79,7 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
     visited = occupancy.of_mixture(p, archive, weights, starts, key_rollout)
 
     # Before there is a history, the first rollouts stand in for one.
-    unseen = (learner.history.seen == 0) & (visited.weight > 0)
+    unseen = (learner.history.seen == 0) & visited.alive
     history = reservoir.add(learner.history, visited.features, unseen, key_history)
     rows = mixture.draw_rows(visited.weight, config.reference_size, key_rows)
     rows = jnp.where(method.from_history, -1, rows)
@@ -101,7 +101,7 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
         "best_policy": best,
         "policy_return": scores.episode_return,
         "policy_step_reward": scores.step_reward,
-        "num_rollout_steps": jnp.sum(visited.weight > 0, dtype=jnp.int32),
+        "num_rollout_steps": jnp.sum(visited.alive, dtype=jnp.int32),
         "num_rollout_invalid": visited.num_invalid,
     }
     return state._replace(key=key, learner=learner), metrics

@@ -12,7 +12,7 @@ from maxent_jax.runs import FIGURES
 
 COVERAGE_AXES = (
     ("iteration", "iteration"),
-    ("env_steps", "env steps"),
+    ("env_steps", "thousand env steps"),
     ("wall_seconds", "wall-clock (s)"),
 )
 AGENT, MIXTURE, RANDOM = "#1b6ca8", "#d1495b", "#7a7a7a"
@@ -38,12 +38,13 @@ def curves(run: Run) -> Figure:
             for prefix, name, color, style in lines:
                 values = run.metrics.get(f"{prefix}_{quantity}")
                 if values is not None:
-                    ax.plot(run.metrics[axis], values, style, color=color, label=name, ms=4)
+                    x = run.metrics[axis] / (1000 if axis == "env_steps" else 1)
+                    ax.plot(x, values, style, color=color, label=name, ms=4)
             ax.set_xlabel(axis_label)
             ax.grid(alpha=0.25)
         axes[row, 0].set_ylabel(label)
         axes[row, 0].set_ylim(bottom=0)
-    axes[0, 0].legend(frameon=False, fontsize=9)
+    axes[1, 0].legend(frameon=False, fontsize=9, loc="lower right")
     return _finish(figure, run)
 
 
@@ -59,10 +60,10 @@ def occupancy_map(run: Run, mixture_cells: np.ndarray) -> Figure:
         ("rollouts of the mixture", mixture_cells),
     )
     shares = [np.log10(np.where(cells > 0, cells, np.nan)) for _, cells in panels]
-    low = min(np.nanmin(s) for s in shares)
+    low, high = min(np.nanmin(s) for s in shares), max(np.nanmax(s) for s in shares)
     for ax, (title, _), share in zip(figure.subplots(1, 2), panels, shares, strict=True):
         image = ax.imshow(
-            share.T, origin="lower", extent=_extent(run), aspect="auto", vmin=low, vmax=0
+            share.T, origin="lower", extent=_extent(run), aspect="auto", vmin=low, vmax=high
         )
         ax.set(title=title, xlabel=_axis_name(run, 0), ylabel=_axis_name(run, 1))
     figure.colorbar(image, ax=figure.axes, label="log10 share of the states", shrink=0.85)

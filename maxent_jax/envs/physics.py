@@ -17,7 +17,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import batch
+from mujoco import batch, mjx
+from mujoco.mjx._src import collision_driver
 
 BACKENDS = ("auto", "mjx", "mujoco", "warp")
 PROFILES = ("reference", "fast")
@@ -81,8 +82,6 @@ def make_step(model: mujoco.MjModel, backend: str, frame_skip: int) -> Step:
 
 
 def _mjx_step(model: mujoco.MjModel, frame_skip: int) -> Step:
-    from mujoco import mjx  # slow to import, and the mujoco backend does not need it
-
     device_model = mjx.put_model(model)
     blank = mjx.make_data(device_model)
 
@@ -108,8 +107,6 @@ def _capsule_frames() -> Iterator[None]:
     turns the pyramid of friction: one Ant step in ten ends 1 to 20 % off in velocity, and turning
     the world is no symmetry any more. See google-deepmind/mujoco, issue 2774.
     """
-    from mujoco.mjx._src import collision_driver
-
     colliders = collision_driver._COLLISION_FUNC
     pair = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CAPSULE)
     original = colliders[pair]
