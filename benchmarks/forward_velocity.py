@@ -62,16 +62,17 @@ def main() -> None:
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=180.0, help="of training, compiled")
+    parser.add_argument("--toy", action="store_true", help="does it run? one segment of smoke")
     args = parser.parse_args()
-    config = preset(args.preset, random_baseline=False)
+    name, budget = ("smoke", 0.0) if args.toy else (args.preset, args.seconds)
+    config = preset(name, random_baseline=False)
     common.print_versions()
     key, key_init = jax.random.split(jax.random.key(args.seed))
     carry = init(config, key_init)
     vector_steps = config.vector_steps
     compiled = steps.lower(config, carry, key, vector_steps).compile()
     started, done = time.perf_counter(), 0
-    velocity = float("nan")
-    while time.perf_counter() - started < args.seconds:
+    while done == 0 or time.perf_counter() - started < budget:
         key, key_steps = jax.random.split(key)
         carry, velocities = compiled(carry, key_steps)
         velocity = float(jnp.mean(velocities))
