@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from maxent_jax import algorithm, checkpoint, methods, plotting, runs
 from maxent_jax.algorithm import Programs, State
-from maxent_jax.analysis import load_run
+from maxent_jax.analysis import load_run, paths
 from maxent_jax.cache import enable_compilation_cache
 from maxent_jax.config import Config
 from maxent_jax.density import histogram
@@ -147,7 +147,7 @@ def _draw(directory: Path) -> None:
     run = load_run(directory)
     visited = run.occupancy()
     cells = histogram.count(visited.states, run.parts.env.task.grid, visited.weight)
-    plotting.save_all(run, np.asarray(cells), run.rollout(episodes_per_policy=5))
+    plotting.save_all(run, np.asarray(cells), paths(visited))
 
 
 def _summarise(directory: Path, rows: list[dict[str, Any]]) -> None:

@@ -51,9 +51,9 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
     from maxent_jax.density import histogram
 
     run = analysis.load_run(arguments.directory, arguments.seed_index)
-    visited = run.occupancy(arguments.seed)
+    visited = run.occupancy(arguments.episodes, arguments.seed)
     cells = histogram.count(visited.states, run.parts.env.task.grid, visited.weight)
-    paths = run.rollout(arguments.episodes, arguments.seed)
+    paths = analysis.paths(visited)
     scores = run.scores(visited, arguments.seed)
     plotting.save_all(run, np.asarray(cells), paths)
     ends = analysis.mean_ends(run, paths)

@@ -12,7 +12,6 @@ import numpy as np
 
 from maxent_jax import checkpoint, methods, mixture, occupancy, parts, runs
 from maxent_jax.config import Config
-from maxent_jax.envs import base
 from maxent_jax.mixture import Archive
 from maxent_jax.occupancy import Occupancy, Scores
 from maxent_jax.parts import Parts
@@ -72,41 +71,40 @@ class Run:
             policy = int(jax.random.choice(key_draw, self.weights.shape[0], p=self.weights))
         return self.policy(policy)(s, key_act)
 
-    def rollout(self, episodes_per_policy: int, seed: int = 0) -> Paths:
-        """Fresh episodes of each policy."""
+    def occupancy(self, episodes_per_policy: int = 5, seed: int = 0) -> Occupancy:
+        """Fresh episodes of each policy, with each state's share of the mixture's occupancy."""
         key_starts, key_play = jax.random.split(jax.random.key(seed))
-        who = jnp.repeat(jnp.arange(self.num_policies), episodes_per_policy)
-        starts = self._starts(len(who), key_starts)
-        played = jax.jit(functools.partial(occupancy.play, self.parts))(
-            self.mixture, who, starts, key_play
-        )
-        return Paths(
-            np.moveaxis(np.asarray(played.states), 0, 1),
-            np.asarray(played.alive).T,
-            np.asarray(who),
-        )
+        num_episodes = episodes_per_policy * self.num_policies
+        by_policy = dataclasses.replace(self.config, mixture_episodes=num_episodes, pooled=False)
+        starts = jax.vmap(self.parts.env.reset)(jax.random.split(key_starts, num_episodes))
+        weights = jnp.asarray(self.weights)
+        return _of_mixture(parts.make(by_policy), self.mixture, weights, starts, key_play)
 
-    def occupancy(self, seed: int = 0) -> Occupancy:
-        """Fresh episodes of the mixture, with each state's share of its occupancy."""
-        key_starts, key_play = jax.random.split(jax.random.key(seed))
-        starts = self._starts(self.config.mixture_episodes, key_starts)
-        roll = jax.jit(functools.partial(occupancy.of_mixture, self.parts))
-        return roll(self.mixture, jnp.asarray(self.weights), starts, key_play)
+    def rollout(self, episodes_per_policy: int = 5, seed: int = 0) -> Paths:
+        """Fresh episodes of each policy, as paths."""
+        return paths(self.occupancy(episodes_per_policy, seed))
 
     def scores(self, visited: Occupancy, seed: int = 0) -> Scores:
         """Each policy's return under the reward that these states of the mixture define."""
-        key, size = jax.random.key(seed), self.config.reference_size
-        rows = mixture.draw_rows(visited.weight, size, key)
-        score = jax.jit(functools.partial(occupancy.score, self.parts))
-        return score(visited, visited.features[rows], rows, self.mixture)
+        rows = mixture.draw_rows(visited.weight, self.config.reference_size, jax.random.key(seed))
+        return _score(self.parts, visited, visited.features[rows], rows, self.mixture)
 
     def measures(self, visited: Occupancy, seed: int = 0) -> dict[str, float]:
         """Coverage and entropies of the mixture, named as in the metrics."""
         measured = occupancy.measures(self.parts, visited, jax.random.key(seed))
         return {name: value.item() for name, value in measured.items()}
 
-    def _starts(self, num: int, key: jax.Array) -> base.State:
-        return jax.vmap(self.parts.env.reset)(jax.random.split(key, num))
+
+_of_mixture = jax.jit(occupancy.of_mixture, static_argnums=0)
+_score = jax.jit(occupancy.score, static_argnums=0)
+
+
+def paths(visited: Occupancy) -> Paths:
+    """The episodes that an occupancy was made of."""
+    num_episodes = visited.episode_policy.shape[0]
+    states = np.asarray(visited.states).reshape(-1, num_episodes, visited.states.shape[-1])
+    alive = np.asarray(visited.alive).reshape(-1, num_episodes)
+    return Paths(np.moveaxis(states, 0, 1), alive.T, np.asarray(visited.episode_policy))
 
 
 def load_run(path: str | Path, seed_index: int = 0) -> Run:
@@ -138,12 +136,12 @@ def load_run(path: str | Path, seed_index: int = 0) -> Run:
     )
 
 
-def mean_ends(run: Run, paths: Paths) -> np.ndarray:
+def mean_ends(run: Run, episodes: Paths) -> np.ndarray:
     """[P, 2] metres: the mean of where the episodes of each policy end, on the grid's axes."""
-    last = paths.alive.sum(axis=1) - 1
-    ends = paths.states[np.arange(len(last)), np.maximum(last, 0)]
+    last = episodes.alive.sum(axis=1) - 1
+    ends = episodes.states[np.arange(len(last)), np.maximum(last, 0)]
     ends = ends[:, list(run.parts.env.task.grid.coordinates)]
-    return np.stack([ends[paths.policy == i].mean(axis=0) for i in range(run.num_policies)])
+    return np.stack([ends[episodes.policy == i].mean(axis=0) for i in range(run.num_policies)])
 
 
 def _of_seed(row: dict[str, Any], index: int) -> dict[str, Any]:

@@ -144,5 +144,5 @@ def measures(parts: Parts, occupancy: Occupancy, key: jax.Array) -> Metrics:
         "mixture_entropy": histogram.shannon_entropy(cells),
         "mixture_off_grid_share": jnp.maximum(1 - jnp.sum(cells), 0.0),  # sums round
         "mixture_knn_entropy": entropy.knn_entropy(sample, config.num_neighbors, labels=rows),
-        "mixture_episode_length": jnp.sum(occupancy.alive) / config.mixture_episodes,
+        "mixture_episode_length": jnp.sum(occupancy.alive) / occupancy.episode_policy.shape[0],
     }

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import maxent_jax
-from experiments import driver
+from experiments import driver, train
 from maxent_jax import checkpoint, runs
 from maxent_jax.config import preset
 
@@ -129,15 +129,12 @@ def test_a_killed_run_resumes_to_the_end(tmp_path):
 
 
 def test_resume_without_a_checkpoint_starts_over(tmp_path):
-    directory = tmp_path / "early"
-    directory.mkdir()
-    runs.write_config(directory, preset("smoke", num_iterations=1), {})
-    (directory / "metrics.jsonl").write_text('{"iteration": 1}\n{"itera')
-    call(
-        *("experiments.train", "--preset", "smoke", "--num-iterations", 1),
-        *("--out", directory, "--resume"),
-    )
-    assert [row["env_steps"] for row in runs.read_metrics(directory)] == [400]
+    config = preset("smoke")
+    runs.write_config(tmp_path, config, {})
+    (tmp_path / "metrics.jsonl").write_text('{"iteration": 1}\n{"itera')
+    resumed = train.read_arguments(["--preset", "smoke", "--out", str(tmp_path), "--resume"])
+    driver.train(resumed.config, resumed.directory, time.perf_counter())
+    assert [row["env_steps"] for row in runs.read_metrics(tmp_path)] == [400, 800]
 
 
 def test_several_seeds_train_side_by_side(tmp_path):
