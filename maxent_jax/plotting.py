@@ -111,7 +111,7 @@ def save(figure: Figure, directory: Path, name: str) -> Path:
     """Writes a figure as PNG, whole or not at all."""
     directory.mkdir(parents=True, exist_ok=True)
     path, temporary = directory / f"{name}.png", directory / f"{name}.tmp.png"
-    figure.savefig(temporary, dpi=110)
+    figure.savefig(temporary, dpi=110, bbox_inches="tight")
     return temporary.replace(path)
 
 
