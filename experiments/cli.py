@@ -19,8 +19,10 @@ class UsageError(ValueError):
     """A command line that asks for something impossible; the message is one sentence."""
 
 
-def parse(kind: Callable[..., Arguments], argv: Sequence[str], default: Any = None) -> Arguments:
-    """The arguments as an instance of a dataclass; --help prints its fields and exits.
+def parse(
+    kind: Callable[..., Arguments], argv: Sequence[str], prog: str, default: Any = None
+) -> Arguments:
+    """The arguments of `python -m prog` as a dataclass; --help prints its fields and exits.
 
     Raises:
       UsageError: an unknown flag (with the nearest one), or a value of the wrong type.
@@ -29,7 +31,13 @@ def parse(kind: Callable[..., Arguments], argv: Sequence[str], default: Any = No
     options = {} if default is None else {"default": default}
     try:
         with redirect_stderr(printed):
-            return tyro.cli(kind, args=argv, config=(tyro.conf.OmitArgPrefixes,), **options)
+            return tyro.cli(
+                kind,
+                prog=f"python -m {prog}",
+                args=argv,
+                config=(tyro.conf.OmitArgPrefixes,),
+                **options,
+            )
     except SystemExit as stop:
         if stop.code in (0, None):
             raise

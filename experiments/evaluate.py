@@ -30,7 +30,7 @@ class Arguments:
 
 def main(argv: Sequence[str]) -> None:
     """Parses and checks, and only then loads jax."""
-    arguments = cli.parse(Arguments, argv)
+    arguments = cli.parse(Arguments, argv, "experiments.evaluate")
     if arguments.episodes < 1 or arguments.seed < 0:
         raise cli.UsageError("--episodes must be at least 1, and --seed 0 or more.")
     runs.read_config(arguments.directory)

@@ -38,7 +38,7 @@ def read_arguments(argv: Sequence[str]) -> Arguments:
       UsageError, ConfigError, RunError: one sentence each.
     """
     config = preset(cli.flag_value(argv, "--preset") or Config.preset)
-    arguments = cli.parse(Arguments, argv, default=Arguments(config))
+    arguments = cli.parse(Arguments, argv, "experiments.train", default=Arguments(config))
     directory = arguments.directory
     if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):
         return arguments
