@@ -65,6 +65,9 @@ def entry_point(main: Callable[[Sequence[str]], None]) -> Callable[[], None]:
         except (UsageError, ConfigError, RunError) as mistake:
             print(f"error: {mistake}", file=sys.stderr)
             sys.exit(2)
+        except KeyboardInterrupt:
+            print("interrupted: complete iterations are kept, see --resume", file=sys.stderr)
+            sys.exit(130)
 
     return run
 

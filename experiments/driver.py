@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from maxent_jax import algorithm, checkpoint, methods, plotting, runs
+from maxent_jax import algorithm, checkpoint, methods, parts, plotting, runs
 from maxent_jax.algorithm import Programs, State
 from maxent_jax.analysis import load_run, paths
 from maxent_jax.cache import enable_compilation_cache
@@ -22,18 +22,24 @@ def train(config: Config, directory: Path, process_started: float) -> None:
     """Trains to the end, from the last complete checkpoint if there is one.
 
     Args:
+      directory: exists; empty, or with this very run in it.
       process_started: time.perf_counter() when the program began, for the time to the first step.
     """
     enable_compilation_cache()
-    directory.mkdir(parents=True, exist_ok=True)
     completed = checkpoint.latest_step(directory) or 0
     if completed == config.num_iterations:
-        print(f"{directory} is complete: nothing to do.")
+        if not plotting.all_saved(directory):  # killed after its last checkpoint
+            _draw(directory)
+        print(f"{directory} is complete: nothing to train.")
         return
     if completed:
         state = checkpoint.restore(directory, config)
     else:
-        runs.write_config(directory, config, methods.row(config)._asdict())
+        machine = {
+            "backend": parts.make(config).env.backend,
+            "device": jax.devices()[0].device_kind,
+        }
+        runs.write_config(directory, config, methods.row(config)._asdict(), machine)
         state = algorithm.start(config)
     rows = runs.truncate_metrics(directory, completed)
     clock = _Clock(process_started, rows[-1] if rows else {})
@@ -152,9 +158,12 @@ def _draw(directory: Path) -> None:
 
 def _summarise(directory: Path, rows: list[dict[str, Any]]) -> None:
     last = rows[-1]
+    random = ""
+    if "random_coverage" in last:
+        random = f" ({np.mean(last['random_coverage']):,.0f} by a random policy)"
     print(
-        f"{directory}: {np.mean(last['cumulative_coverage']):,.0f} cells visited in training "
-        f"({np.mean(last.get('random_coverage', np.nan)):,.0f} by a random policy), "
+        f"{directory}: {np.mean(last['cumulative_coverage']):,.0f} cells visited in training"
+        f"{random}, "
         f"{np.mean(last['mixture_coverage']):,.0f} by the mixture, "
         f"{last['wall_seconds']:,.0f} s; figures in {directory / runs.FIGURES}."
     )

@@ -71,10 +71,19 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
     ]
     return {
         "run": str(run.path),
+        "trained_with_seed": run.seed,
+        "episodes_per_policy": arguments.episodes,
+        "rollout_seed": arguments.seed,
+        "reward": run.config.reward,
+        "deviations_from_the_paper": run.config.deviations(),
         "policies": policies,
         "training_coverage": int((run.histogram > 0).sum()),
         "training_entropy": float(histogram.shannon_entropy(jnp.asarray(run.histogram))),
-        "random_coverage": int((run.random_histogram > 0).sum()),
+        **(
+            {"random_coverage": int((run.random_histogram > 0).sum())}
+            if run.config.random_baseline
+            else {}
+        ),
         **run.measures(visited, arguments.seed),
     }
 

@@ -65,6 +65,10 @@ def main(argv: Sequence[str]) -> None:
     """Parses, checks, and only then loads jax."""
     started = time.perf_counter()
     arguments = read_arguments(argv)
+    try:
+        arguments.directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cli.UsageError(f"cannot write to {arguments.directory}: {error.strerror}.") from None
     from experiments import driver  # loads jax
 
     driver.train(arguments.config, arguments.directory, started)

@@ -87,7 +87,7 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
         jnp.where(method.from_history, history.points, visited.features[rows]),
         jnp.where(method.from_history, reservoir.count(history), config.reference_size),
     )
-    scores = occupancy.score(p, visited, reference.points, rows, archive)
+    scores = occupancy.score(p, visited, reference.points, rows, archive, reference.num_filled)
     best = occupancy.best(scores, visited)
     learner = learner._replace(
         agent=_start(p, method, archive, learner.agent, best, key_scratch),

@@ -33,6 +33,7 @@ class Run:
     path: Path
     config: Config
     metrics: dict[str, np.ndarray]
+    seed: int
     mixture: Archive
     histogram: np.ndarray  # [bins, bins] states met in training
     random_histogram: np.ndarray  # [bins, bins] states met by the random policy beside it
@@ -65,7 +66,10 @@ class Run:
         return functools.partial(agent.act, self.parts.sac, actor)
 
     def act(self, s: jax.Array, key: jax.Array, policy: int | None = None) -> jax.Array:
-        """Actions [..., A] for states [..., D] by one policy, drawn by weight unless named."""
+        """Actions [..., A] for states [..., D] by one policy, drawn by weight unless named.
+
+        The mixture keeps the policy that it has drawn for a whole episode: to play it, draw once.
+        """
         key_draw, key_act = jax.random.split(key)
         if policy is None:
             policy = int(jax.random.choice(key_draw, self.weights.shape[0], p=self.weights))
@@ -75,10 +79,10 @@ class Run:
         """Fresh episodes of each policy, with each state's share of the mixture's occupancy."""
         key_starts, key_play = jax.random.split(jax.random.key(seed))
         num_episodes = episodes_per_policy * self.num_policies
-        by_policy = dataclasses.replace(self.config, mixture_episodes=num_episodes, pooled=False)
-        starts = jax.vmap(self.parts.env.reset)(jax.random.split(key_starts, num_episodes))
+        by_policy = parts.make(dataclasses.replace(self.config, pooled=False))
+        starts = jax.vmap(by_policy.env.reset)(jax.random.split(key_starts, num_episodes))
         weights = jnp.asarray(self.weights)
-        return _of_mixture(parts.make(by_policy), self.mixture, weights, starts, key_play)
+        return _of_mixture(by_policy, self.mixture, weights, starts, key_play)
 
     def rollout(self, episodes_per_policy: int = 5, seed: int = 0) -> Paths:
         """Fresh episodes of each policy, as paths."""
@@ -130,6 +134,7 @@ def load_run(path: str | Path, seed_index: int = 0) -> Run:
         path=directory,
         config=config,
         metrics={name: _column(rows, name) for name in rows[0]} if rows else {},
+        seed=config.seed + seed_index,
         mixture=results.archive,
         histogram=np.asarray(results.visits.cells),
         random_histogram=np.asarray(results.random_visits.cells),

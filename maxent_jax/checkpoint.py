@@ -91,8 +91,14 @@ def _load(run_directory: Path, abstract: dict[str, Any]) -> dict[str, Any]:
     step = latest_step(run_directory)
     if step is None:
         raise CheckpointError(f"{run_directory} holds no complete checkpoint.")
-    with _open(run_directory) as checkpointer:
-        return checkpointer.load_checkpointables(step, abstract)
+    try:
+        with _open(run_directory) as checkpointer:
+            return checkpointer.load_checkpointables(step, abstract)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise CheckpointError(
+            f"checkpoint {step} of {run_directory} is damaged: {reason}"
+        ) from error
 
 
 @contextlib.contextmanager

@@ -97,7 +97,8 @@ class Config:
     """η of the geometric weights."""
     reference: str = "method"
     """What the reward is measured against: mixture (its rollouts), history (a uniform sample of
-    all states visited in training), or as the method says."""
+    all states visited in training and, before there were any, in the first rollouts), or as the
+    method says."""
     refresh_period: int = BY_METHOD
     """Steps of all envs between refreshes of the reward; 0: once an iteration; -1: as the method
     says. A mixture changes once an iteration, so that any period above 0 matters to history."""
@@ -162,8 +163,13 @@ class Config:
         named = {name: why for name, (value, why) in _PAPER.items() if getattr(self, name) != value}
         if self.shaping > 0 and self.shaping_space == "position":
             named["shaping_space"] = "the potential is measured in position alone"
+        if self.reward != "paper":
+            named["reward_distance"] = "the scale c of the reward's form"
         if self.episodic_weight == 0:
             named["episodic_weight"] = "no episodic term"
+        for name in ("weights", "reference", "start", "refresh_period"):
+            if getattr(self, name) != _DEFAULTS[name]:
+                named[name] = "set apart from its method"
         return named
 
 
@@ -185,6 +191,8 @@ _PAPER: dict[str, tuple[Any, str]] = {
     "reward_scale": (1.0, "the reward is scaled"),
     "shaping": (0.0, "the reward is shaped by a potential"),
     "shaping_survives_death": (False, "the potential survives death: not policy-invariant"),
+    "pooled": (False, "the reference is drawn from the pooled states of the mixture"),
+    "eta": (0.1, "η is not 0.1"),
     "num_neighbors": (3, "k is not 3"),
     "leave_own_out": (False, "policies are scored without their own states"),
     "hidden_layers": (2, "networks do not have 2 hidden layers"),
@@ -323,8 +331,12 @@ def _check_together(c: Config) -> None:
             f"num-envs × num-segments = {group}.",
         ),
         (
-            updates < 1 or updates != round(updates),
+            updates < 0.5 or abs(updates - round(updates)) > 1e-6,
             f"updates-per-step × num-envs is {updates:g}, but must be a whole number from 1 up.",
+        ),
+        (
+            c.seed + c.num_seeds > 2**31,
+            f"seed + num-seeds is {c.seed + c.num_seeds}, but must not exceed 2^31.",
         ),
         (
             c.num_neighbors >= c.reference_size,

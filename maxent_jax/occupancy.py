@@ -40,28 +40,28 @@ def of_mixture(
 ) -> Occupancy:
     """Rolls the mixture out, one policy for each episode.
 
-    Unless the config pools, every policy plays the same number of episodes and its states share
-    its weight: episodes end early when health fails, and a pooled sample would weigh policies by
-    how long they live. Pooled, policies are drawn by weight and all states count alike.
+    Unless the config pools, policies play equal numbers of episodes, up to one, and the states of
+    each share its weight: episodes end early when health fails, and a pooled sample would weigh
+    policies by how long they live. Pooled, policies are drawn by weight and all states count alike.
 
     Args:
       weights: [P].
       starts: [E, ...].
     """
-    config = parts.config
     key_assign, key_act = jax.random.split(key)
+    num_episodes = starts.done.shape[0]
     slots = jnp.arange(weights.shape[0])
-    if config.pooled:
+    if parts.config.pooled:
         plays, offset = weights, jax.random.uniform(key_assign)
     else:
         plays = (slots < archive.size) / archive.size
         offset = jnp.asarray(0.5)
-    episode_policy = mixture.assign_episodes(plays, config.mixture_episodes, offset)
+    episode_policy = mixture.assign_episodes(plays, num_episodes, offset)
     reached = play(parts, archive, episode_policy, starts, key_act)
     states = reached.states.reshape(-1, reached.states.shape[-1])
     policy = jnp.broadcast_to(episode_policy, reached.alive.shape).reshape(-1)
     alive = reached.alive.reshape(-1).astype(jnp.float32)
-    if config.pooled:
+    if parts.config.pooled:
         weight = alive
     else:
         lived = jnp.zeros(weights.shape[0]).at[policy].add(alive)
@@ -95,14 +95,22 @@ def play(
 
 
 def score(
-    parts: Parts, occupancy: Occupancy, points: jax.Array, rows: jax.Array, archive: Archive
+    parts: Parts,
+    occupancy: Occupancy,
+    points: jax.Array,
+    rows: jax.Array,
+    archive: Archive,
+    num_filled: jax.Array | None = None,
 ) -> Scores:
     """Each policy's return under the reward that the reference points define.
 
     Args:
       points: [M, F] the reference.
       rows: [M] int32, which row of the occupancy each point is; -1 for none. A state does not see
-        itself, nor, with leave_own_out, any state of its own policy.
+        itself, nor, with leave_own_out, any state of its own policy. Points of a history carry no
+        row: a state that entered it is not told apart.
+      archive: whose policies are scored.
+      num_filled: [] how many of the points are there; all when left out.
     """
     config = parts.config
     num_rows = occupancy.policy.shape[0]
@@ -115,7 +123,12 @@ def score(
         point_label = jnp.where(alone | (rows < 0), rows, occupancy.policy[rows])
     point_label = jnp.where(rows < 0, NONE_EXCLUDED - 1, point_label)
     distance = knn_distances(
-        occupancy.features, points, config.num_neighbors, exclude=label, labels=point_label
+        occupancy.features,
+        points,
+        config.num_neighbors,
+        exclude=label,
+        count=num_filled,
+        labels=point_label,
     )[:, -1]
     reward = rewards.of_distance(distance, config.reward, config.reward_distance, points.shape[1])
     alive = occupancy.alive.astype(jnp.float32)
@@ -144,5 +157,5 @@ def measures(parts: Parts, occupancy: Occupancy, key: jax.Array) -> Metrics:
         "mixture_entropy": histogram.shannon_entropy(cells),
         "mixture_off_grid_share": jnp.maximum(1 - jnp.sum(cells), 0.0),  # sums round
         "mixture_knn_entropy": entropy.knn_entropy(sample, config.num_neighbors, labels=rows),
-        "mixture_episode_length": jnp.sum(occupancy.alive) / occupancy.episode_policy.shape[0],
+        "evaluation_episode_length": jnp.sum(occupancy.alive) / occupancy.episode_policy.shape[0],
     }

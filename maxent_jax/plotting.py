@@ -15,6 +15,7 @@ COVERAGE_AXES = (
     ("env_steps", "thousand env steps"),
     ("wall_seconds", "wall-clock (s)"),
 )
+NAMES = ("curves", "occupancy", "fireworks")
 AGENT, MIXTURE, RANDOM = "#1b6ca8", "#d1495b", "#7a7a7a"
 
 
@@ -101,10 +102,14 @@ def fireworks(run: Run, paths: Paths) -> Figure:
 
 def save_all(run: Run, mixture_cells: np.ndarray, paths: Paths) -> None:
     """The three figures, into the run's directory."""
-    figures = run.path / FIGURES
-    save(curves(run), figures, "curves")
-    save(occupancy_map(run, mixture_cells), figures, "occupancy")
-    save(fireworks(run, paths), figures, "fireworks")
+    drawn = curves(run), occupancy_map(run, mixture_cells), fireworks(run, paths)
+    for name, figure in zip(NAMES, drawn, strict=True):
+        save(figure, run.path / FIGURES, name)
+
+
+def all_saved(run_directory: Path) -> bool:
+    """Whether the run's directory holds the three figures."""
+    return all((run_directory / FIGURES / f"{name}.png").exists() for name in NAMES)
 
 
 def save(figure: Figure, directory: Path, name: str) -> Path:
@@ -128,7 +133,7 @@ def _finish(figure: Figure, run: Run) -> Figure:
     """Title and, below, every deviation from the paper by name."""
     config = run.config
     figure.suptitle(
-        f"MaxEnt-{config.method.upper()}, {config.env}, preset {config.preset}, seed {config.seed}"
+        f"MaxEnt-{config.method.upper()}, {config.env}, preset {config.preset}, seed {run.seed}"
     )
     named = ", ".join(f"{name}={getattr(config, name)}" for name in config.deviations())
     figure.supxlabel(f"departs from the paper in: {named or 'nothing'}", fontsize=6, wrap=True)

@@ -24,8 +24,10 @@ class CheckpointError(RunError):
     """A run without a checkpoint that can be loaded."""
 
 
-def write_config(directory: Path, config: Config, method: dict[str, Any]) -> None:
-    """config.json: every setting, what departs from the paper, and the stack."""
+def write_config(
+    directory: Path, config: Config, method: dict[str, Any], machine: dict[str, str]
+) -> None:
+    """config.json: every setting, what departs from the paper, the stack and the machine."""
     departures = {
         name: {"value": getattr(config, name), "why": why}
         for name, why in config.deviations().items()
@@ -44,6 +46,7 @@ def write_config(directory: Path, config: Config, method: dict[str, Any]) -> Non
         },
         "versions": {"python": platform.python_version()}
         | {name: importlib.metadata.version(name) for name in PACKAGES},
+        "machine": machine,
     }
     write_json(directory / CONFIG, content)
 
@@ -82,7 +85,10 @@ def read_metrics(directory: Path) -> list[dict[str, Any]]:
     """The rows of metrics.jsonl; an unfinished last line is left out."""
     path = directory / METRICS
     lines = path.read_text().split("\n")[:-1] if path.exists() else []
-    return [json.loads(line) for line in lines]
+    try:
+        return [json.loads(line) for line in lines]
+    except ValueError:
+        raise RunError(f"{path} holds a line that is not JSON.") from None
 
 
 def truncate_metrics(directory: Path, num_iterations: int) -> list[dict[str, Any]]:

@@ -139,10 +139,14 @@ def measure(parts: Parts, reference: Reference, experience: Experience) -> Exper
     experience = experience._replace(distance=distance(after))
     if config.shaping == 0:
         return experience
-    dims = POSITION_DIMS if config.shaping_space == "position" else after.shape[1]
-    ends = jnp.concatenate([parts.phi(experience.observation), after])
-    before, after = jnp.split(distance(ends[:, :dims]), 2)
-    return experience._replace(potential_distance=before, next_potential_distance=after)
+    before = parts.phi(experience.observation)
+    if config.shaping_space == "features":
+        return experience._replace(
+            potential_distance=distance(before), next_potential_distance=experience.distance
+        )
+    ends = jnp.concatenate([before, after])[:, :POSITION_DIMS]
+    at_start, at_end = jnp.split(distance(ends), 2)
+    return experience._replace(potential_distance=at_start, next_potential_distance=at_end)
 
 
 def unshaped_reward(parts: Parts, distance: jax.Array) -> jax.Array:

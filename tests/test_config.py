@@ -36,6 +36,7 @@ def test_presets_are_valid_and_survive_a_round_trip(name):
         (dict(steps_per_iteration=401), "a multiple of num-envs × num-segments = 8"),
         (dict(updates_per_step=0.3), "a whole number"),
         (dict(updates_per_step=1e-9), "a whole number"),
+        (dict(seed=2**31), "must not exceed 2"),
         (dict(mixture_episodes=2), "each of the 3 policies"),
         (dict(reference_size=801), "at most 800 states"),
         (dict(num_envs=400, num_segments=1, replay_size=399), "adds 400"),
@@ -63,3 +64,20 @@ def test_configs_of_all_methods_share_one_program():
     for changes in (dict(method="h"), dict(seed=3), dict(refresh_period=5), dict(eta=0.01)):
         assert preset("smoke", **changes).program() == base.program()
     assert preset("smoke", num_envs=8).program() != base.program()
+
+
+def test_a_hybrid_of_methods_is_named():
+    hybrid = preset("paper", start="last", reference="history", refresh_period=1, pooled=True)
+    assert set(hybrid.deviations()) == {"start", "reference", "refresh_period", "pooled"}
+
+
+def test_choices_are_those_of_the_modules_that_make_them():
+    from maxent_jax import config, envs, methods, rewards
+    from maxent_jax.envs import physics
+
+    assert set(config.ENVS) == set(envs.TASKS)
+    assert set(config.METHODS) == set(methods.ROWS)
+    assert config.BACKENDS == physics.BACKENDS
+    assert config.PHYSICS == physics.PROFILES
+    assert set(config.REWARDS) == set(rewards.FORMS)
+    assert set(config.STARTS) == {"method", *methods.STARTS}

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -104,6 +105,17 @@ def test_resuming_a_finished_run_changes_nothing(finished):
     assert contents() == before
 
 
+def test_a_run_killed_before_its_figures_gets_them_on_resume(finished):
+    (finished / "figures" / "curves.png").unlink()
+    call("experiments.train", "--preset", "smoke", "--out", finished, "--resume")
+    assert (finished / "figures" / "curves.png").exists()
+
+
+def test_a_run_can_be_looked_at_with_any_number_of_episodes(finished):
+    visited = maxent_jax.load_run(finished).occupancy(episodes_per_policy=1)
+    assert np.bincount(visited.episode_policy).tolist() == [1, 1, 1]
+
+
 def test_a_killed_run_resumes_to_the_end(tmp_path):
     directory = tmp_path / "killed"
     line = command("experiments.train", *TINY, "--num-iterations", 5, "--out", directory)
@@ -130,7 +142,7 @@ def test_a_killed_run_resumes_to_the_end(tmp_path):
 
 def test_resume_without_a_checkpoint_starts_over(tmp_path):
     config = preset("smoke")
-    runs.write_config(tmp_path, config, {})
+    runs.write_config(tmp_path, config, {}, {})
     (tmp_path / "metrics.jsonl").write_text('{"iteration": 1}\n{"itera')
     resumed = train.read_arguments(["--preset", "smoke", "--out", str(tmp_path), "--resume"])
     driver.train(resumed.config, resumed.directory, time.perf_counter())
@@ -138,16 +150,15 @@ def test_resume_without_a_checkpoint_starts_over(tmp_path):
 
 
 def test_several_seeds_train_side_by_side(tmp_path):
-    directory = tmp_path / "seeds"
     config = preset("smoke", num_iterations=1, num_segments=1, num_seeds=2)
-    driver.train(config, directory, time.perf_counter())
-    (row,) = runs.read_metrics(directory)
+    driver.train(config, tmp_path, time.perf_counter())
+    (row,) = runs.read_metrics(tmp_path)
     assert row["env_steps"] == [400, 400]
-    loaded = [maxent_jax.load_run(directory, seed_index=i) for i in range(2)]
+    loaded = [maxent_jax.load_run(tmp_path, seed_index=i) for i in range(2)]
     assert [run.histogram.sum() for run in loaded] == [400, 400]
     assert not np.array_equal(loaded[0].histogram, loaded[1].histogram)
     with pytest.raises(runs.RunError, match="2 seeds"):
-        maxent_jax.load_run(directory, seed_index=2)
+        maxent_jax.load_run(tmp_path, seed_index=2)
 
 
 @pytest.mark.parametrize("backend", ["mujoco", "mjx"])
@@ -155,7 +166,6 @@ def test_several_seeds_train_side_by_side(tmp_path):
     ("method", "period"), [("h", -1), ("la", 1), ("la", 10), ("la", 0), ("v", -1)]
 )
 def test_every_method_runs_on_both_backends(tmp_path, backend, method, period):
-    directory = tmp_path / "run"
     num_iterations = {"mujoco": 2, "mjx": 1}[backend]  # MJX takes 20 s an iteration on a CPU
     config = preset(
         "smoke",
@@ -164,8 +174,8 @@ def test_every_method_runs_on_both_backends(tmp_path, backend, method, period):
         refresh_period=period,
         num_iterations=num_iterations,
     )
-    driver.train(config, directory, time.perf_counter())  # in this process: compiled once
-    assert [row["env_steps"] for row in runs.read_metrics(directory)] == [400, 800][:num_iterations]
+    driver.train(config, tmp_path, time.perf_counter())  # in this process: compiled once
+    assert [row["env_steps"] for row in runs.read_metrics(tmp_path)] == [400, 800][:num_iterations]
 
 
 @pytest.mark.parametrize(
@@ -210,14 +220,28 @@ def test_resume_with_other_settings_names_them(finished):
     ],
 )
 def test_evaluate_refuses_a_directory_that_is_no_run(tmp_path, damage):
-    runs.write_config(tmp_path, preset("smoke"), {})
+    runs.write_config(tmp_path, preset("smoke"), {}, {})
     damage(tmp_path)
     done = call("experiments.evaluate", tmp_path, expect=2)
     assert done.stderr.count("\n") == 1 and str(tmp_path) in done.stderr
 
 
+def test_a_damaged_checkpoint_is_named(finished, tmp_path):
+    directory = tmp_path / "damaged"
+    shutil.copytree(finished, directory)
+    shutil.rmtree(directory / "checkpoints" / "2" / "results")
+    done = call("experiments.evaluate", directory, expect=2)
+    assert "checkpoint 2" in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_a_directory_that_cannot_be_made_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    done = call("experiments.train", "--out", tmp_path / "file" / "run", expect=2)
+    assert "cannot write" in done.stderr and done.stderr.count("\n") == 1
+
+
 def test_evaluate_says_when_there_is_no_checkpoint(tmp_path):
-    runs.write_config(tmp_path, preset("smoke"), {})
+    runs.write_config(tmp_path, preset("smoke"), {}, {})
     assert "no complete checkpoint" in call("experiments.evaluate", tmp_path, expect=2).stderr
 
 

@@ -82,8 +82,8 @@ def make_step(model: mujoco.MjModel, backend: str, frame_skip: int) -> Step:
 
 
 def _mjx_step(model: mujoco.MjModel, frame_skip: int) -> Step:
-    device_model = mjx.put_model(model)
-    blank = mjx.make_data(device_model)
+    device_model = mjx.put_model(model, impl="jax")
+    blank = mjx.make_data(device_model, impl="jax")
 
     def single(qpos, qvel, warmstart, control):
         data = blank.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=control)
