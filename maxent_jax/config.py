@@ -76,7 +76,7 @@ class Config:
     """Where the potential's distance is measured: features (it is R), or position (the first two
     alone: free of the noise of the joints)."""
     shaping_survives_death: bool = False
-    """A state in which health fails keeps its potential: faster, and not policy-invariant."""
+    """A state in which health fails keeps its potential: not policy-invariant."""
     episodic_weight: float = 0.0
     """λ of the episodic term. 0: none."""
 
