@@ -115,8 +115,8 @@ def shaped(
     """r + γΦ(s') - Φ(s), all [...] but for γ, `discount`.
 
     With Φ = 0 at a terminal state the optimal policies are those of r (Ng et al. 1999). With
-    `survives_death` a state in which health fails keeps its Φ, so that a death far out does not cost
-    what was gained on the way: not policy-invariant.
+    `survives_death` a state in which health fails keeps its Φ, so that a death far out does not
+    cost what was gained on the way: not policy-invariant.
 
     Args:
       alive: 0 where health failed at s', else 1; a time limit keeps its potential.
