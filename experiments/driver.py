@@ -1,6 +1,5 @@
 """Runs the three programs of an iteration, and logs, saves and draws in between."""
 
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -167,4 +166,3 @@ def _summarise(directory: Path, rows: list[dict[str, Any]]) -> None:
         f"{np.mean(last['mixture_coverage']):,.0f} by the mixture, "
         f"{last['wall_seconds']:,.0f} s; figures in {directory / runs.FIGURES}."
     )
-    sys.stdout.flush()
