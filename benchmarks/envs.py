@@ -1,6 +1,6 @@
 """How many env steps a second does each physics backend make, and its peers?
 
-Ant under random actions, without resets. Ours and bare `mujoco.rollout` start from the same states
+Random actions, without resets. Ours and bare `mujoco.rollout` start from the same states
 on the ground and take the same actions, so that beside each rate stands how far its motion departs
 from that of C MuJoCo: a solver that stops early is faster, and is not the same environment.
 """
@@ -18,14 +18,17 @@ import numpy as np
 from mujoco import rollout
 
 from benchmarks import common
-from maxent_jax import envs
+from maxent_jax import envs, runtime
+from maxent_jax.config import PHYSICS
 from maxent_jax.envs import physics
 from maxent_jax.envs.task import MujocoEnv
 
-SETTLE_STEPS = 40  # of random actions before a workload starts: 2 s, by which an ant has landed
+# Random actions before a workload starts: an ant has landed, the others have not fallen yet.
+SETTLE_STEPS = {"ant": 40, "walker2d": 5, "humanoid": 5}
 MIN_STEPS = DRIFT_STEPS = 50  # of each env
 MUJOCO_STEPS = 6400  # of all envs together, at least; C MuJoCo is too fast for fewer
 SEED = 0
+GYMNASIUM = {"ant": "Ant-v4", "walker2d": "Walker2d-v4", "humanoid": "Humanoid-v4"}
 
 
 class Workload(NamedTuple):
@@ -49,14 +52,22 @@ class Measurement(NamedTuple):
     extra: dict[str, float]  # further columns
 
 
-def make_workload(backend: str, profile: str, num_envs: int, num_steps: int) -> Workload:
-    env, ground = envs.make("ant", backend, profile), envs.make("ant", "mujoco", "reference")
-    random = np.random.default_rng(SEED)
-    shape = (SETTLE_STEPS + num_steps, num_envs, env.action_size)
+def make_workload(name: str, backend: str, profile: str, num_envs: int, num_steps: int) -> Workload:
+    """An environment, and the states and actions that all are given."""
+    ground = MujocoEnv(envs.TASKS[name], "mujoco")
+    starts, actions = settled(ground, num_envs, num_steps, SEED)
+    return Workload(MujocoEnv(envs.TASKS[name], backend, profile), starts, actions)
+
+
+def settled(env: MujocoEnv, num_envs: int, num_steps: int, seed: int) -> tuple[Any, np.ndarray]:
+    """States [N, ...] after some random actions, and further actions [T, N, A]."""
+    random = np.random.default_rng(seed)
+    settle = SETTLE_STEPS[env.task.name]
+    shape = (settle + num_steps, num_envs, env.action_size)
     actions = random.uniform(-1, 1, shape).astype(np.float32)
-    starts = jax.vmap(env.reset)(jax.random.split(jax.random.key(SEED), num_envs))
-    starts, _ = jax.jit(functools.partial(scan, ground))(starts, actions[:SETTLE_STEPS])
-    return Workload(env, starts, actions[SETTLE_STEPS:])
+    starts = jax.vmap(env.reset)(jax.random.split(jax.random.key(seed), num_envs))
+    starts, _ = jax.jit(functools.partial(scan, env))(starts, actions[:settle])
+    return starts, actions[settle:]
 
 
 def scan(env: MujocoEnv, starts: Any, actions: jax.Array) -> tuple[Any, jax.Array]:
@@ -81,7 +92,7 @@ def ours(workload: Workload, repeats: int) -> Measurement:
 def bare_rollout(workload: Workload, repeats: int) -> Measurement:
     """C MuJoCo on all cores, of the reference model, all steps known in advance: the ceiling."""
     task = workload.env.task
-    model = physics.load_model(task.xml, "reference")
+    model = physics.load_model(task.xml)
     full = mujoco.mjtState.mjSTATE_FULLPHYSICS
     starts = np.zeros((workload.actions.shape[1], mujoco.mj_stateSize(model, full)))
     where_qpos, where_qvel = slice(1, 1 + model.nq), slice(1 + model.nq, 1 + model.nq + model.nv)
@@ -108,13 +119,15 @@ def in_control_range(model: mujoco.MjModel, actions: np.ndarray) -> np.ndarray:
 def gymnasium_sync(gymnasium, workload: Workload, repeats: int) -> Measurement:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # v4 is what the paper used
-        env = gymnasium.make_vec("Ant-v4", workload.actions.shape[1], vectorization_mode="sync")
+        name = GYMNASIUM[workload.env.task.name]
+        env = gymnasium.make_vec(name, workload.actions.shape[1], vectorization_mode="sync")
     return stepped(env, workload, repeats)
 
 
 def envpool_threads(envpool, workload: Workload, repeats: int) -> Measurement:
     num_envs = workload.actions.shape[1]
-    env = envpool.make_gymnasium("Ant-v4", num_envs=num_envs, num_threads=common.CORES)
+    name = GYMNASIUM[workload.env.task.name]
+    env = envpool.make_gymnasium(name, num_envs=num_envs, num_threads=common.CORES)
     return stepped(env, workload, repeats)
 
 
@@ -132,19 +145,31 @@ def stepped(env, workload: Workload, repeats: int) -> Measurement:
     return Measurement(rate, None, {})
 
 
+def brax_on_mjx(brax_envs, workload: Workload, repeats: int) -> Measurement:
+    """brax's own environment of that name: another model, with other options."""
+    env = brax_envs.get_environment(workload.env.task.name, backend="mjx")
+    num_envs = workload.actions.shape[1]
+    starts = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(SEED), num_envs))
+    inputs = starts, jnp.asarray(workload.actions[:MIN_STEPS, :, : env.action_size])
+    program, _ = common.compiled(functools.partial(scan, env), *inputs)
+    seconds = common.median_seconds(lambda: program(*inputs), repeats)
+    return Measurement(inputs[1].shape[0] * num_envs / seconds, None, {})
+
+
 PEERS = (
+    common.Peer("brax", "brax.envs", brax_on_mjx),
     common.Peer("gymnasium", "gymnasium", gymnasium_sync),
     common.Peer("envpool", "envpool", envpool_threads),
 )
 
 
-def fidelity(found: Measurement, truth: Measurement) -> dict[str, float]:
+def fidelity(env: MujocoEnv, found: Measurement, truth: Measurement) -> dict[str, float]:
     """How far the motion lies from that of C MuJoCo, which computes in float64."""
     if found.positions is None or truth.positions is None or found is truth:
         return {}
     departure = found.positions - truth.positions
     num_steps = min(len(departure), DRIFT_STEPS)
-    torso = departure[num_steps - 1, :, :3]
+    torso = departure[num_steps - 1, :, : 3 if env.task.torso else 2]
     return {
         "largest_error_after_1_step": float(np.max(np.abs(departure[0]))),
         "drift_steps": num_steps,
@@ -153,29 +178,29 @@ def fidelity(found: Measurement, truth: Measurement) -> dict[str, float]:
 
 
 def measure(cases, peers, repeats: int) -> Iterator[dict[str, Any]]:
-    """Rows for each case (backend, physics, envs, steps), and for the peers at the same sizes."""
-    ceilings: dict[tuple[int, int], Measurement] = {}
+    """Rows for each case (env, backend, physics, envs, steps), and for the peers at equal sizes."""
+    ceilings: dict[tuple[str, int, int], Measurement] = {}
 
     def row(who: str, workload: Workload, found: Measurement, ceiling: Measurement, **more):
         num_steps, num_envs, _ = workload.actions.shape
         return common.progress(
             {
                 "benchmark": "envs",
-                "env": "ant",
+                "env": workload.env.task.name,
                 "who": who,
                 "envs": num_envs,
                 "steps_of_each": num_steps,
                 "env_steps_per_second": found.steps_per_second,
                 "over_bare_rollout": found.steps_per_second / ceiling.steps_per_second,
                 **more,
-                **fidelity(found, ceiling),
+                **fidelity(workload.env, found, ceiling),
                 **found.extra,
             }
         )
 
-    for backend, profile, num_envs, num_steps in cases:
-        workload = make_workload(backend, profile, num_envs, num_steps)
-        size = num_envs, num_steps
+    for name, backend, profile, num_envs, num_steps in cases:
+        workload = make_workload(name, backend, profile, num_envs, num_steps)
+        size = name, num_envs, num_steps
         if size not in ceilings:
             ceilings[size] = bare_rollout(workload, repeats)
             yield row("mujoco.rollout", workload, ceilings[size], ceilings[size])
@@ -188,18 +213,27 @@ def measure(cases, peers, repeats: int) -> Iterator[dict[str, Any]]:
 
 def main() -> None:
     flags = common.parser(__doc__)
-    flags.add_argument("--mujoco-envs", type=int, nargs="*", default=[16, 32, 128, 512])
-    flags.add_argument("--mjx-envs", type=int, nargs="*", default=[8, 32])
+    flags.add_argument("--env", nargs="*", choices=list(GYMNASIUM), default=list(GYMNASIUM))
+    flags.add_argument("--mujoco-envs", type=int, nargs="*", default=[16, 128, 1024])
+    flags.add_argument("--mjx-envs", type=int, nargs="*", default=[64, 256])
+    flags.add_argument("--warp-envs", type=int, nargs="*", default=[])
     args = flags.parse_args()
+    runtime.prepare(simulates_in_jax=True)
     common.print_versions(PEERS)
-    cases = [
-        ("mujoco", "reference", n, max(MIN_STEPS, MUJOCO_STEPS // n)) for n in args.mujoco_envs
-    ]
-    cases += [("mjx", p, n, MIN_STEPS) for p in physics.PROFILES for n in args.mjx_envs]
+    cases = []
+    for name in args.env:
+        cases += [
+            (name, "mujoco", "reference", n, max(MIN_STEPS, MUJOCO_STEPS // n))
+            for n in args.mujoco_envs
+        ]
+        cases += [(name, "mjx", p, n, MIN_STEPS) for p in PHYSICS for n in args.mjx_envs]
+        cases += [(name, "warp", "reference", n, MIN_STEPS) for n in args.warp_envs]
+    peers = common.importable(PEERS)
     if args.toy:
         print("toy: without mjx, which compiles for tens of seconds", file=sys.stderr)
-        cases = [("mujoco", "reference", 4, 4)]
-    rows = list(measure(cases, common.importable(PEERS), args.repeats))
+        cases = [("humanoid", "mujoco", "reference", 4, 4)]
+        peers = [(peer, module) for peer, module in peers if peer.module == "gymnasium"]
+    rows = list(measure(cases, peers, args.repeats))
     for row in rows:
         common.emit(row)
 

@@ -9,10 +9,9 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from maxent_jax import algorithm, checkpoint, methods, parts, plotting, runs
+from maxent_jax import algorithm, checkpoint, methods, parts, plotting, runs, runtime
 from maxent_jax.algorithm import Programs, State
 from maxent_jax.analysis import load_run, paths
-from maxent_jax.cache import enable_compilation_cache
 from maxent_jax.config import Config
 from maxent_jax.density import histogram
 
@@ -24,7 +23,7 @@ def train(config: Config, directory: Path, process_started: float) -> None:
       directory: exists; empty, or with this very run in it.
       process_started: time.perf_counter() when the program began, for the time to the first step.
     """
-    enable_compilation_cache()
+    runtime.prepare(config.simulates_in_jax)
     completed = checkpoint.latest_step(directory) or 0
     if completed == config.num_iterations:
         if not plotting.all_saved(directory):  # killed after its last checkpoint
@@ -151,7 +150,7 @@ class _Bar:
 def _draw(directory: Path) -> None:
     run = load_run(directory)
     visited = run.occupancy()
-    cells = histogram.count(visited.states, run.parts.env.task.grid, visited.weight)
+    cells = histogram.count(visited.states, run.parts.grid, visited.weight)
     plotting.save_all(run, np.asarray(cells), paths(visited))
 
 

@@ -33,10 +33,10 @@ def main(argv: Sequence[str]) -> None:
     arguments = cli.parse(Arguments, argv, "experiments.evaluate")
     if arguments.episodes < 1 or arguments.seed < 0:
         raise cli.UsageError("--episodes must be at least 1, and --seed 0 or more.")
-    runs.read_config(arguments.directory)
-    from maxent_jax.cache import enable_compilation_cache
+    config = runs.read_config(arguments.directory)
+    from maxent_jax import runtime
 
-    enable_compilation_cache()
+    runtime.prepare(config.simulates_in_jax)
     report = evaluate(arguments)
     runs.write_json(arguments.directory / "evaluation.json", report)
     _print(report)
@@ -52,7 +52,7 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
 
     run = analysis.load_run(arguments.directory, arguments.seed_index)
     visited = run.occupancy(arguments.episodes, arguments.seed)
-    cells = histogram.count(visited.states, run.parts.env.task.grid, visited.weight)
+    cells = histogram.count(visited.states, run.parts.grid, visited.weight)
     paths = analysis.paths(visited)
     scores = run.scores(visited, arguments.seed)
     plotting.save_all(run, np.asarray(cells), paths)
@@ -64,8 +64,7 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
             "episode_return": float(scores.episode_return[i]),
             "step_reward": float(scores.step_reward[i]),
             "episode_length": float(paths.alive[paths.policy == i].sum(1).mean()),
-            "end_distance": float(np.hypot(*ends[i])),
-            "end_direction": float(np.degrees(np.arctan2(ends[i][1], ends[i][0]))),
+            "mean_end": ends[i].tolist(),
         }
         for i in range(run.num_policies)
     ]
@@ -75,6 +74,7 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
         "episodes_per_policy": arguments.episodes,
         "rollout_seed": arguments.seed,
         "reward": run.config.reward,
+        "coordinates": run.parts.grid.names,
         "deviations_from_the_paper": run.config.deviations(),
         "policies": policies,
         "training_coverage": int((run.histogram > 0).sum()),
@@ -90,12 +90,13 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
 
 def _print(report: dict[str, Any]) -> None:
     policies = report["policies"]
-    print("policy  weight   return  reward/step  length  mean end (m)  direction (deg)")
+    ends = ", ".join(report["coordinates"])
+    print(f"policy  weight   return  reward/step  length  mean end: {ends}")
     for p in policies:
         print(
             f"{p['policy']:6d}  {p['weight']:6.3f}  {p['episode_return']:7.1f}"
             f"  {p['step_reward']:11.3f}  {p['episode_length']:6.0f}"
-            f"  {p['end_distance']:12.1f}  {p['end_direction']:15.0f}"
+            f"  {p['mean_end'][0]:8.2f} {p['mean_end'][1]:8.2f}"
         )
     for name, value in report.items():
         if isinstance(value, int | float):

@@ -1,7 +1,8 @@
-"""Makes the feature table of an environment: projections divided by their largest magnitude.
+"""Makes the feature table of an environment: coordinates kept, and projections of the rest.
 
-The magnitudes come from 10,000 steps of a uniformly random policy on C MuJoCo with Gymnasium's
-options, so that no backend and no run changes the space in which densities are measured.
+Projections are divided by their largest magnitude over 10,000 steps of a uniformly random policy,
+on C MuJoCo with Gymnasium's options, so that no backend and no run changes the space in which
+densities are measured. The classic environments have few enough coordinates to keep all.
 """
 
 import argparse
@@ -16,11 +17,38 @@ from maxent_jax import envs, features
 from maxent_jax.envs import base
 
 NUM_ENVS, VECTOR_STEPS, SEED = 10, 1000, 0
-COORDINATES = {"ant": ("x", "y")}
+# What is kept of the state: name, and how much of it counts as 1.
+KEPT = {
+    "ant": {"x": 1.0, "y": 1.0},
+    "walker2d": {"x": 1.0, "z": 1.0},
+    "humanoid": {"x": 1.0, "y": 1.0},
+    "pendulum": {"cos": 1.0, "sin": 1.0, "velocity": 8.0},
+    "mountain_car": {"position": 0.9, "velocity": 0.07},
+}
 
 
 def measure(name: str) -> dict:
     """The table as JSON-ready data."""
+    env = envs.make(name)
+    kept = list(range(len(KEPT[name])))  # the first coordinates of the state
+    if len(kept) == env.observation_size:
+        scaled, names = np.empty((0, 0)), []
+    else:
+        projection = features.raw_projection(env.observation_size - len(kept))
+        largest = np.abs(np.delete(_random_states(name), kept, axis=1) @ projection).max(axis=0)
+        scaled = (projection / largest).round(8)
+        names = [f"projection_{i}" for i in range(projection.shape[1])]
+    return {
+        "env": name,
+        "coordinates": kept,
+        "units": list(KEPT[name].values()),
+        "names": [*KEPT[name], *names],
+        "projection": scaled.tolist(),
+    }
+
+
+def _random_states(name: str) -> np.ndarray:
+    """[10,000, D] float64."""
     env = envs.make(name, backend="mujoco")
     key_init, key_steps = jax.random.split(jax.random.key(SEED))
     episodes = base.init(env, NUM_ENVS, 1000, key_init)
@@ -32,22 +60,12 @@ def measure(name: str) -> dict:
         return episodes, transition.next_observation
 
     _, states = jax.lax.scan(step, episodes, jax.random.split(key_steps, VECTOR_STEPS))
-    flat = np.asarray(states, np.float64).reshape(-1, env.observation_size)
-    kept = list(env.task.grid.coordinates)
-    projection = features.raw_projection(env.observation_size)
-    largest = np.abs(np.delete(flat, kept, axis=1) @ projection).max(axis=0)
-    return {
-        "env": name,
-        "coordinates": kept,
-        "names": [*COORDINATES[name], *(f"projection_{i}" for i in range(projection.shape[1]))],
-        "random_steps": len(flat),
-        "projection": (projection / largest).round(8).tolist(),
-    }
+    return np.asarray(states, np.float64).reshape(-1, env.observation_size)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--env", choices=sorted(COORDINATES), required=True)
+    parser.add_argument("--env", choices=sorted(KEPT), required=True)
     name = parser.parse_args().env
     path = Path(maxent_jax.__file__).parent / "tables" / f"features_{name}.json"
     path.write_text(json.dumps(measure(name), indent=1) + "\n")

@@ -37,7 +37,8 @@ def read_arguments(argv: Sequence[str]) -> Arguments:
     Raises:
       UsageError, ConfigError, RunError: one sentence each.
     """
-    config = preset(cli.flag_value(argv, "--preset") or Config.preset)
+    env = cli.flag_value(argv, "--env") or Config.env
+    config = preset(cli.flag_value(argv, "--preset") or Config.preset, env=env)
     arguments = cli.parse(Arguments, argv, "experiments.train", default=Arguments(config))
     directory = arguments.directory
     if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):

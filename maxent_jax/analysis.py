@@ -12,6 +12,7 @@ import numpy as np
 
 from maxent_jax import checkpoint, methods, mixture, occupancy, parts, runs
 from maxent_jax.config import Config
+from maxent_jax.density import histogram
 from maxent_jax.mixture import Archive
 from maxent_jax.occupancy import Occupancy, Scores
 from maxent_jax.parts import Parts
@@ -142,10 +143,10 @@ def load_run(path: str | Path, seed_index: int = 0) -> Run:
 
 
 def mean_ends(run: Run, episodes: Paths) -> np.ndarray:
-    """[P, 2] metres: the mean of where the episodes of each policy end, on the grid's axes."""
+    """[P, 2]: the mean of where the episodes of each policy end, on the grid's axes."""
     last = episodes.alive.sum(axis=1) - 1
     ends = episodes.states[np.arange(len(last)), np.maximum(last, 0)]
-    ends = ends[:, list(run.parts.env.task.grid.coordinates)]
+    ends = np.asarray(histogram.locate(ends, run.parts.grid))
     return np.stack([ends[episodes.policy == i].mean(axis=0) for i in range(run.num_policies)])
 
 

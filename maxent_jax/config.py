@@ -4,7 +4,15 @@ import dataclasses
 import difflib
 from typing import Any
 
-ENVS = ("ant",)
+MUJOCO_ENVS = ("ant", "walker2d", "humanoid")
+CLASSIC_ENVS = ("pendulum", "mountain_car")
+ENVS = MUJOCO_ENVS + CLASSIC_ENVS
+BRAX_ENVS = (
+    *("ant", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum"),
+    *("inverted_double_pendulum", "pusher", "reacher", "swimmer", "walker2d"),
+)
+TORSO_ENVS = ("ant", "humanoid")  # a floating torso has a heading, and can be upside down
+TURNING_ENVS = ("ant",)  # whose observation we know how to turn about the vertical
 METHODS = ("h", "la", "v")
 BACKENDS = ("auto", "mjx", "mujoco", "warp")
 PHYSICS = ("reference", "fast")
@@ -26,15 +34,16 @@ class Config:
     """Settings of a run; frozen and hashable, changed with `dataclasses.replace`."""
 
     env: str = "ant"
-    """Environment."""
+    """Environment: ant, walker2d, humanoid, pendulum, mountain_car, brax:NAME, or user:NAME for one
+    that maxent_jax.envs.register was told of."""
     method: str = "v"
     """h (Hazan 2019), la (Liu & Abbeel 2021) or v (Veritas)."""
     preset: str = "quick"
     """The values that the other flags start from: smoke, quick or paper."""
     backend: str = "auto"
-    """Physics: mjx, mujoco (C MuJoCo), or auto, which is mujoco on a CPU."""
+    """Physics: mjx, mujoco (C MuJoCo), warp (MuJoCo Warp), or auto: mujoco on a CPU, else mjx."""
     physics: str = "reference"
-    """reference (the options of Gymnasium's XML) or fast (fewer solver iterations)."""
+    """reference (the options of Gymnasium's XML) or fast (cheaper ones, see the README)."""
     seed: int = 0
     """Of everything random but the feature projection."""
     num_seeds: int = 1
@@ -149,6 +158,11 @@ class Config:
         """P: the initial policy and one an iteration."""
         return self.num_iterations + 1
 
+    @property
+    def simulates_in_jax(self) -> bool:
+        """Whether MJX or brax computes the physics, for all that is known before jax is loaded."""
+        return self.backend == "mjx" or self.env.startswith("brax:")
+
     def program(self) -> "Config":
         """This config with all that is data, not program, at its default.
 
@@ -160,7 +174,8 @@ class Config:
 
     def deviations(self) -> dict[str, str]:
         """What this config does otherwise than the paper, by field."""
-        named = {name: why for name, (value, why) in _PAPER.items() if getattr(self, name) != value}
+        paper = _PAPER | {"episode_length": _time_limit(self.env)}
+        named = {name: why for name, (value, why) in paper.items() if getattr(self, name) != value}
         if self.shaping > 0 and self.shaping_space == "position":
             named["shaping_space"] = "the potential is measured in position alone"
         if self.reward != "paper":
@@ -181,8 +196,7 @@ _DEFAULTS = {field.name: field.default for field in dataclasses.fields(Config)}
 
 # What the paper does, and how a run that does otherwise says so.
 _PAPER: dict[str, tuple[Any, str]] = {
-    "physics": ("reference", "the constraint solver stops early"),
-    "episode_length": (1000, "the time limit is not 1000 steps"),
+    "physics": ("reference", "the physics is simplified"),
     "torque_limit": (1.0, "torques are limited to a share of the control range"),
     "end_flipped": (False, "an episode also ends upside down"),
     "policy_inputs": ("state", "networks see the state in the heading's frame"),
@@ -224,15 +238,6 @@ PRESETS: dict[str, dict[str, Any]] = {
         replay_size=2_000,
     ),
     "quick": dict(
-        torque_limit=0.4,
-        end_flipped=True,
-        policy_inputs="heading",
-        yaw_copies=1,
-        shaping=100.0,
-        shaping_space="position",
-        shaping_survives_death=True,
-        reward_distance=20.0,
-        reward_scale=8.0,
         hidden_size=128,
         critic_layer_norm=True,
         learning_rate=1e-3,
@@ -254,30 +259,88 @@ PRESETS: dict[str, dict[str, Any]] = {
     ),
 }
 
+_LOCOMOTION = dict(
+    shaping=100.0,
+    shaping_space="position",
+    shaping_survives_death=True,
+    reward_distance=20.0,
+    reward_scale=8.0,
+)
+_CLASSIC = dict(episode_length=200)
+
+# What a preset does otherwise in some environment.
+_IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
+    ("quick", "ant"): dict(
+        torque_limit=0.4,
+        end_flipped=True,
+        policy_inputs="heading",
+        yaw_copies=1,
+        **_LOCOMOTION,
+    ),
+    ("quick", "walker2d"): _LOCOMOTION,
+    ("quick", "humanoid"): dict(policy_inputs="heading", **_LOCOMOTION),
+    **{("paper", env): dict(reference_size=8_192, **_CLASSIC) for env in CLASSIC_ENVS},
+    **{
+        ("quick", env): dict(
+            steps_per_iteration=9_600,
+            reference_size=4_096,
+            reward_distance=0.1,
+            **_CLASSIC,
+        )
+        for env in CLASSIC_ENVS
+    },
+}
+
 
 def preset(name: str, **changes: Any) -> Config:
-    """The config of that preset, with changes.
+    """The config of that preset, in its environment, with changes.
 
     Raises:
       ConfigError: an unknown preset, or a value that no run can have.
     """
     if name not in PRESETS:
-        raise ConfigError(_unknown("preset", name, PRESETS))
-    return Config(**{"preset": name, **PRESETS[name], **changes})
+        raise ConfigError(unknown("preset", name, PRESETS))
+    env = changes.get("env", Config.env)
+    in_env = _IN_ENV.get((name, env), {})
+    return Config(**{"preset": name, **PRESETS[name], **in_env, **changes})
 
 
-def _unknown(what: str, value: str, known: Any) -> str:
+def check_env(name: str) -> None:
+    """Raises ConfigError unless an environment can have that name."""
+    names = (*ENVS, *(f"brax:{env}" for env in BRAX_ENVS))
+    if name not in names and not name.startswith("user:"):
+        raise ConfigError(unknown("env", name, names))
+
+
+def check_physics(env: str, backend: str, physics: str) -> None:
+    """Raises ConfigError where the environment has no such backend or physics."""
+    for what, value, known in (("backend", backend, BACKENDS), ("physics", physics, PHYSICS)):
+        if value not in known:
+            raise ConfigError(unknown(what, value, known))
+    if env in MUJOCO_ENVS or env.startswith("user:"):
+        return
+    backends = ("auto",) if env in CLASSIC_ENVS else ("auto", "mjx")
+    if backend not in backends:
+        raise ConfigError(f"backend is {backend}, but {env} has only: {', '.join(backends)}.")
+    if physics != "reference":
+        raise ConfigError(f"physics is {physics}, but {env} has only: reference.")
+
+
+def _time_limit(env: str) -> tuple[int, str]:
+    steps = 200 if env in CLASSIC_ENVS else 1000
+    return steps, f"the time limit is not {steps} steps"
+
+
+def unknown(what: str, value: str, known: Any) -> str:
+    """The sentence for a value that is not among the known ones, naming the nearest."""
     nearest = difflib.get_close_matches(value, known, n=1, cutoff=0.4)
     hint = f"did you mean '{nearest[0]}'?" if nearest else f"choose one of {', '.join(known)}."
     return f"unknown {what} '{value}': {hint}"
 
 
 _CHOICES = {
-    "env": ENVS,
     "method": METHODS,
     "preset": PRESETS,
-    "backend": BACKENDS,
-    "physics": PHYSICS,
     "reward": REWARDS,
     "policy_inputs": INPUTS,
     "shaping_space": SPACES,
@@ -301,9 +364,11 @@ _NOT_NEGATIVE = (
 
 
 def _check(config: Config) -> None:
+    check_env(config.env)
+    check_physics(config.env, config.backend, config.physics)
     for name, known in _CHOICES.items():
         if getattr(config, name) not in known:
-            raise ConfigError(_unknown(name.replace("_", "-"), getattr(config, name), known))
+            raise ConfigError(unknown(name.replace("_", "-"), getattr(config, name), known))
     bounds = (
         (_AT_LEAST_ONE, lambda x: x >= 1, "at least 1"),
         (_POSITIVE, lambda x: 0 < x < float("inf"), "a positive number"),
@@ -320,11 +385,25 @@ def _check(config: Config) -> None:
 
 
 def _check_together(c: Config) -> None:
-    if c.backend == "warp":
-        raise ConfigError("backend warp is not part of this release: choose auto, mjx or mujoco.")
     group = c.num_envs * c.num_segments
     updates = c.updates_per_step * c.num_envs
     for wrong, sentence in (
+        (
+            c.torque_limit < 1 and c.env not in MUJOCO_ENVS,
+            f"torque-limit is {c.torque_limit}, but {c.env} has no torques to limit.",
+        ),
+        (
+            c.end_flipped and c.env not in TORSO_ENVS,
+            f"end-flipped is on, but {c.env} has no floating torso that could be upside down.",
+        ),
+        (
+            c.policy_inputs == "heading" and c.env not in TORSO_ENVS,
+            f"policy-inputs is heading, but {c.env} has no floating torso with a heading.",
+        ),
+        (
+            c.yaw_copies and c.env not in TURNING_ENVS,
+            f"yaw-copies is {c.yaw_copies}, but {c.env} cannot be turned about the vertical.",
+        ),
         (
             c.steps_per_iteration % group,
             f"steps-per-iteration is {c.steps_per_iteration}, but must be a multiple of "

@@ -149,7 +149,7 @@ def best(scores: Scores, occupancy: Occupancy) -> jax.Array:
 def measures(parts: Parts, occupancy: Occupancy, key: jax.Array) -> Metrics:
     """Coverage and entropies of the mixture, on the environment's grid and in feature space."""
     config = parts.config
-    cells = histogram.count(occupancy.states, parts.env.task.grid, occupancy.weight)
+    cells = histogram.count(occupancy.states, parts.grid, occupancy.weight)
     rows = mixture.draw_rows(occupancy.weight, config.reference_size, key)
     sample = occupancy.features[rows]
     return {

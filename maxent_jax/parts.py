@@ -1,24 +1,29 @@
 """What a config makes once, and every step uses: the environment, the learner's fixed half, phi."""
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
 from maxent_jax import envs
-from maxent_jax.config import Config
-from maxent_jax.envs.task import MujocoEnv
-from maxent_jax.features import FeatureMap, make_feature_map
+from maxent_jax.config import MUJOCO_ENVS, Config
+from maxent_jax.density.histogram import Grid
+from maxent_jax.envs.base import Env
+from maxent_jax.envs.torso import Torso
+from maxent_jax.features import make_feature_map
 from maxent_jax.sac import agent
+from maxent_jax.types import Features
 
 
 class Parts(NamedTuple):
     """Static: nothing here changes in a run, or depends on a config's data fields."""
 
     config: Config
-    env: MujocoEnv
+    env: Env
+    grid: Grid
+    torso: Torso | None
     sac: agent.Sac
-    phi: FeatureMap
+    phi: Features
 
 
 def make(config: Config) -> Parts:
@@ -29,14 +34,15 @@ def make(config: Config) -> Parts:
 @functools.lru_cache(maxsize=8)
 def _make(config: Config) -> Parts:
     with jax.ensure_compile_time_eval():  # may be called first while something is being traced
-        env = envs.make(
-            config.env,
-            config.backend,
-            config.physics,
-            torque_limit=config.torque_limit,
-            end_flipped=config.end_flipped,
-        )
-        heading = config.policy_inputs == "heading"
-        inputs = env.task.heading_inputs if heading else lambda observation: observation
+        entry = envs.entry(config.env)
+        deviations: dict[str, Any] = {}
+        if config.env in MUJOCO_ENVS:
+            deviations = {"torque_limit": config.torque_limit, "end_flipped": config.end_flipped}
+        env = entry.make(config.backend, config.physics, **deviations)
+        inputs = lambda observation: observation
+        if config.policy_inputs == "heading":
+            assert entry.torso is not None  # checked by Config
+            inputs = entry.torso.heading_inputs
         sac = agent.make(config, env.observation_size, env.action_size, inputs)
-        return Parts(config, env, sac, make_feature_map(config.env))
+        phi = make_feature_map(config.env)
+        return Parts(config, env, entry.grid, entry.torso, sac, phi)

@@ -4,9 +4,11 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from maxent_jax.analysis import Paths, Run
+from maxent_jax.density import histogram
 from maxent_jax.density.histogram import Grid
 from maxent_jax.runs import FIGURES
 
@@ -23,7 +25,7 @@ def curves(run: Run) -> Figure:
     """Coverage and entropy against iterations, env steps and wall-clock."""
     figure = Figure(figsize=(11, 6.4), layout="constrained")
     axes = figure.subplots(2, 3, sharey="row")
-    bins = run.parts.env.task.grid.bins
+    bins = run.parts.grid.bins
     rows = (
         ("coverage", f"visited cells of {bins[0] * bins[1]:,}"),
         ("entropy", "histogram entropy (nats)"),
@@ -66,7 +68,8 @@ def occupancy_map(run: Run, mixture_cells: np.ndarray) -> Figure:
         image = ax.imshow(
             share.T, origin="lower", extent=_extent(run), aspect="auto", vmin=low, vmax=high
         )
-        ax.set(title=title, xlabel=_axis_name(run, 0), ylabel=_axis_name(run, 1))
+        _name_axes(ax, run)
+        ax.set_title(title)
     figure.colorbar(image, ax=figure.axes, label="log10 share of the states", shrink=0.85)
     return _finish(figure, run)
 
@@ -77,15 +80,15 @@ def fireworks(run: Run, paths: Paths) -> Figure:
     ax = figure.subplots()
     colors = matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, max(run.num_policies - 1, 1)))
     for states, alive, policy in zip(*paths, strict=True):
-        xy = states[alive][:, list(run.parts.env.task.grid.coordinates)]
+        xy = np.asarray(histogram.locate(states[alive], run.parts.grid))
         color = "black" if policy == 0 else colors[policy - 1]
         ax.plot(*xy.T, color=color, lw=0.9, alpha=0.8)
         ax.plot(*xy[-1:].T, "o", color=color, ms=3)
     for policy in range(run.num_policies):
         color = "black" if policy == 0 else colors[policy - 1]
         ax.plot([], [], color=color, label=f"π{policy}" + (" (untrained)" if policy == 0 else ""))
-    ax.set(xlabel=_axis_name(run, 0), ylabel=_axis_name(run, 1))
-    ax.set(title="paths of the archived policies; dots where they end")
+    _name_axes(ax, run)
+    ax.set_title("paths of the archived policies; dots where they end")
     low_x, high_x, low_y, high_y = _extent(run)
     ax.plot(
         [low_x, high_x, high_x, low_x, low_x],
@@ -94,7 +97,8 @@ def fireworks(run: Run, paths: Paths) -> Figure:
         color=RANDOM,
         lw=0.8,
     )
-    ax.set_aspect("equal")
+    if run.parts.torso is not None:  # a map, seen from above
+        ax.set_aspect("equal")
     ax.grid(alpha=0.25)
     ax.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
     return _finish(figure, run)
@@ -121,12 +125,13 @@ def save(figure: Figure, directory: Path, name: str) -> Path:
 
 
 def _extent(run: Run) -> tuple[float, float, float, float]:
-    grid: Grid = run.parts.env.task.grid
+    grid: Grid = run.parts.grid
     return grid.low[0], grid.high[0], grid.low[1], grid.high[1]
 
 
-def _axis_name(run: Run, axis: int) -> str:
-    return f"{run.parts.phi.names[axis]} (m)"
+def _name_axes(ax: Axes, run: Run) -> None:
+    x_name, y_name = run.parts.grid.names
+    ax.set(xlabel=x_name, ylabel=y_name)
 
 
 def _finish(figure: Figure, run: Run) -> Figure:

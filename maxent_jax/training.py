@@ -63,7 +63,7 @@ def init(parts: Parts, key: jax.Array) -> Learner:
     if config.episodic_weight > 0:
         memory = jnp.zeros((config.num_envs, config.episode_length, dims))
     zero = jnp.zeros((), jnp.int32)
-    unvisited = Visits(jnp.zeros(parts.env.task.grid.bins, jnp.int32), zero)
+    unvisited = Visits(jnp.zeros(parts.grid.bins, jnp.int32), zero)
     return Learner(
         agent=sac_agent.init(sac, key_agent),
         replay=replay.init(Experience(state, action, state, *([scalar] * 5)), config.replay_size),
@@ -114,9 +114,10 @@ def step(parts: Parts, method: Method, learner: Learner, key: jax.Array) -> tupl
         gradient_steps=learner.gradient_steps + config.updates_per_vector_step,
     )
     learner, metrics = _learn(parts, method, learner, key_learn)
-    flipped = parts.env.task.flipped(transition.next_observation)
+    if parts.torso is not None:
+        flipped = parts.torso.flipped(transition.next_observation)
+        metrics["flipped_share"] = jnp.mean(flipped.astype(jnp.float32))
     metrics |= {
-        "flipped_share": jnp.mean(flipped.astype(jnp.float32)),
         "num_deaths": jnp.sum(transition.terminated, dtype=jnp.int32),
         "num_time_limits": jnp.sum(transition.truncated, dtype=jnp.int32),
         "num_invalid": jnp.sum(~everyone.valid, dtype=jnp.int32),
@@ -220,20 +221,21 @@ def _with_yaw_copies(parts: Parts, transition: Transition, bonus: jax.Array, key
     angles = jax.random.uniform(
         key, (config.yaw_copies, config.num_envs), minval=-jnp.pi, maxval=jnp.pi
     )
-    rotate = parts.env.task.rotate
-    copies = [
-        original._replace(
-            observation=rotate(original.observation, angle),
-            next_observation=rotate(original.next_observation, angle),
-        )
-        for angle in angles
-    ]
+    copies = [_turned(parts, original, angle) for angle in angles]
     experience = jax.tree.map(lambda *rows: jnp.concatenate(rows), original, *copies)
     return experience, jnp.tile(transition.valid, 1 + config.yaw_copies)
 
 
+def _turned(parts: Parts, experience: Experience, angle: jax.Array) -> Experience:
+    assert parts.torso is not None and parts.torso.rotate is not None  # checked by Config
+    return experience._replace(
+        observation=parts.torso.rotate(experience.observation, angle),
+        next_observation=parts.torso.rotate(experience.next_observation, angle),
+    )
+
+
 def _visit(parts: Parts, visits: Visits, transition: Transition) -> Visits:
-    grid = parts.env.task.grid
+    grid = parts.grid
     valid = transition.valid.astype(jnp.int32)
     cells = histogram.count(transition.next_observation, grid, valid)
     return Visits(visits.cells + cells, visits.off_grid + jnp.sum(valid) - jnp.sum(cells))

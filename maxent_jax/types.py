@@ -4,12 +4,23 @@ N envs, T time, B batch, D state, A action, F feature, M reference points, K nei
 P policies, S seeds. Leading axes come first in every shape; `...` stands for any of them.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 
 Metrics = dict[str, jax.Array]
 """Diagnostics by name; nothing in it is needed for the next step."""
+
+
+class Features(Protocol):
+    """phi(s[..., D]) -> [..., F]: the space in which densities are measured."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the features, [F]."""
+
+    def __call__(self, observation: jax.Array, /) -> jax.Array:
+        """The features of states."""
 
 
 class Transition(NamedTuple):

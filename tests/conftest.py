@@ -5,10 +5,10 @@ import os
 import jax
 import pytest
 
-from maxent_jax.cache import enable_compilation_cache
+from maxent_jax import runtime
 
 os.environ.setdefault("MPLBACKEND", "Agg")
-enable_compilation_cache()
+runtime.prepare(simulates_in_jax=True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_legacy_prng_key", "error")
 

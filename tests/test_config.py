@@ -1,17 +1,20 @@
 """Values that no run can have are refused in one sentence, before anything is loaded."""
 
+import dataclasses
+
 import pytest
 
-from maxent_jax.config import PRESETS, Config, ConfigError, preset
+from maxent_jax.config import ENVS, PRESETS, Config, ConfigError, preset
 
 
+@pytest.mark.parametrize("env", [*ENVS, "brax:halfcheetah", "user:mine"])
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets_are_valid_and_survive_a_round_trip(name):
-    import dataclasses
-
-    config = preset(name)
+def test_presets_are_valid_in_every_environment_and_survive_a_round_trip(name, env):
+    config = preset(name, env=env)
     assert Config(**dataclasses.asdict(config)) == config
-    assert hash(config) == hash(preset(name))
+    assert hash(config) == hash(preset(name, env=env))
+    if name == "paper":
+        assert config.deviations() == {}
 
 
 @pytest.mark.parametrize(
@@ -20,7 +23,13 @@ def test_presets_are_valid_and_survive_a_round_trip(name):
         (dict(env="antt"), "did you mean 'ant'"),
         (dict(method="x"), "choose one of h, la, v"),
         (dict(backend="mujocoo"), "did you mean 'mujoco'"),
-        (dict(backend="warp"), "not part of this release"),
+        (dict(env="brax:antt"), "did you mean 'brax:ant'"),
+        (dict(env="pendulum", backend="mjx"), "pendulum has only: auto"),
+        (dict(env="brax:ant", physics="fast"), "brax:ant has only: reference"),
+        (dict(env="pendulum", torque_limit=0.5), "no torques to limit"),
+        (dict(env="walker2d", end_flipped=True), "no floating torso that could be upside down"),
+        (dict(env="walker2d", policy_inputs="heading"), "no floating torso with a heading"),
+        (dict(env="humanoid", yaw_copies=1), "cannot be turned"),
         (dict(reward="log2"), "did you mean 'log'"),
         (dict(num_envs=-1), "num-envs is -1, but must be at least 1"),
         (dict(num_iterations=0), "at least 1"),
@@ -73,11 +82,12 @@ def test_a_hybrid_of_methods_is_named():
 
 def test_choices_are_those_of_the_modules_that_make_them():
     from maxent_jax import config, envs, methods, rewards
-    from maxent_jax.envs import physics
 
-    assert set(config.ENVS) == set(envs.TASKS)
+    torsos = {name: task.torso for name, task in envs.TASKS.items() if task.torso is not None}
+    assert set(config.MUJOCO_ENVS) == set(envs.TASKS)
+    assert set(config.CLASSIC_ENVS) == set(envs.CLASSIC)
+    assert set(config.TORSO_ENVS) == set(torsos)
+    assert set(config.TURNING_ENVS) == {n for n, t in torsos.items() if t.rotate is not None}
     assert set(config.METHODS) == set(methods.ROWS)
-    assert config.BACKENDS == physics.BACKENDS
-    assert config.PHYSICS == physics.PROFILES
     assert set(config.REWARDS) == set(rewards.FORMS)
     assert set(config.STARTS) == {"method", *methods.STARTS}

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from maxent_jax import features
-from maxent_jax.config import ENVS
+from maxent_jax.config import CLASSIC_ENVS, MUJOCO_ENVS, ConfigError
 from maxent_jax.features import make_feature_map
 
 COORDINATES = {"ant": (("x", 0), ("y", 1)), "walker2d": (("x", 0), ("z", 1))}
 COORDINATES["humanoid"] = COORDINATES["ant"]
-every_env = pytest.mark.parametrize("env_name", ENVS)
+every_env = pytest.mark.parametrize("env_name", MUJOCO_ENVS)
 
 
 def states(phi, *shape):
@@ -116,6 +116,23 @@ def test_random_steps_of_ant_in_gymnasium_fill_the_unit_interval():
     assert size.max(0).min() > 0.5
 
 
-def test_an_environment_without_a_table_is_refused():
-    with pytest.raises(ValueError, match="measure_features"):
+@pytest.mark.parametrize("env_name", CLASSIC_ENVS)
+def test_a_classic_state_is_kept_whole_in_units_of_its_range(env_name):
+    phi = make_feature_map(env_name)
+    s = np.random.default_rng(0).normal(size=(4, 5, len(phi.names))).astype(np.float32)
+    np.testing.assert_allclose(phi(s), s / np.float32(phi.units), rtol=1e-6)
+
+
+def test_the_default_map_gives_unit_variance_to_unit_variance():
+    phi = features._default(observation_size=60)
+    s = np.random.default_rng(0).normal(size=(20_000, 60)).astype(np.float32)
+    found = np.asarray(phi(s))
+    np.testing.assert_array_equal(found[:, :2], s[:, :2])
+    assert phi.names == ("state_0", "state_1", *(f"projection_{i}" for i in range(5)))
+    # The norm of 58 standard normal factors over sqrt(58): 1 within 9 % = 1/sqrt(2 * 58), thrice.
+    assert np.abs(found[:, 2:].std(0) - 1).max() < 0.28
+
+
+def test_an_unknown_environment_is_refused():
+    with pytest.raises(ConfigError, match="unknown env 'nowhere'"):
         make_feature_map("nowhere")

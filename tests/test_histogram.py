@@ -9,9 +9,10 @@ from scipy import stats
 from maxent_jax.density import histogram
 from maxent_jax.density.histogram import Grid
 
-ANT = Grid((0, 1), (-40.0, -40.0), (40.0, 40.0), (100, 100))
-WALKER = Grid((2, 0), (-20.0, 0.5), (5.0, 2.0), (30, 7))
-EXACT = Grid((0, 1), (-4.0, -2.0), (4.0, 2.0), (8, 16))  # edges that float32 represents
+NAMES = ("a", "b")
+ANT = Grid(NAMES, (-40.0, -40.0), (40.0, 40.0), (100, 100))
+WALKER = Grid(NAMES, (-20.0, 0.5), (5.0, 2.0), (30, 7), coordinates=(2, 0))
+EXACT = Grid(NAMES, (-4.0, -2.0), (4.0, 2.0), (8, 16))  # edges that float32 represents
 GRIDS = pytest.mark.parametrize("grid", [ANT, WALKER, EXACT], ids=["ant", "walker", "exact"])
 
 
@@ -56,7 +57,9 @@ def test_fractional_weights_add_up_as_in_numpy():
 
 
 def test_a_state_on_an_edge_falls_where_numpy_puts_it():
-    edges = [np.linspace(a, b, n + 1) for a, b, n in zip(*EXACT[1:], strict=True)]
+    edges = [
+        np.linspace(a, b, n + 1) for a, b, n in zip(EXACT.low, EXACT.high, EXACT.bins, strict=True)
+    ]
     states = np.stack(np.meshgrid(*edges), -1).reshape(-1, 2).astype(np.float32)
     counts = histogram.count(states, EXACT)
     np.testing.assert_array_equal(counts, expected_count(states, EXACT))

@@ -10,9 +10,11 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "maxent_jax"
 # The reading order of the package, first to last.
 ORDER = [
-    *("types", "config", "runs", "cache"),
+    *("types", "config", "runs", "runtime"),
     *("density.histogram", "density.knn", "density.entropy", "density.reservoir"),
-    *("envs.physics", "envs.task", "envs.ant", "envs", "envs.base", "rollout", "features"),
+    *("envs.physics", "envs.mjx_backend", "envs.mujoco_backend", "envs.torso", "envs.task"),
+    *("envs.ant", "envs.walker2d", "envs.humanoid", "envs.pendulum", "envs.mountain_car"),
+    *("envs", "envs.base", "rollout", "features"),
     *("rewards", "sac.networks", "sac.replay", "sac.losses", "sac.agent", "mixture", "methods"),
     *("parts", "occupancy", "training", "algorithm", "checkpoint", "analysis", "plotting"),
 ]

@@ -225,7 +225,7 @@ def test_scores_are_those_by_hand(key, leave_own_out, source, num_policies):
     if source == "history":  # points that no state of these rollouts is
         points, rows = points + 0.1, jnp.full_like(rows, -1)
     scores = occupancy.score(
-        Parts(config, None, None, None), found, points, rows, archive_of(num_policies)
+        Parts(config, *[None] * 5), found, points, rows, archive_of(num_policies)
     )
     expected = expected_scores(found, points, rows, config, num_policies)
     # Sums of up to 60 float32 rewards of order 1.
@@ -241,7 +241,7 @@ def test_a_parked_policy_scores_low_only_among_its_own_states():
     rows = jnp.arange(NUM_STATES, dtype=jnp.int32)
     best = {}
     for leave_own_out in (False, True):
-        p = Parts(preset("smoke", leave_own_out=leave_own_out), None, None, None)
+        p = Parts(preset("smoke", leave_own_out=leave_own_out), *[None] * 5)
         scores = occupancy.score(p, found, found.features, rows, archive_of(2))
         best[leave_own_out] = int(occupancy.best(scores, found))
         if not leave_own_out:
@@ -253,7 +253,7 @@ def test_a_policy_without_weight_is_scored_all_the_same(key):
     # As MaxEnt-H weighs its older policies: they play, and the mixture does without them.
     found = hand_made(key)
     weightless = found._replace(weight=jnp.where(found.policy == 0, 0.0, found.weight))
-    p = Parts(preset("smoke"), None, None, None)
+    p = Parts(preset("smoke"), *[None] * 5)
     rows = jnp.arange(NUM_STATES, dtype=jnp.int32)
     scores = [
         occupancy.score(p, each, found.features, rows, archive_of(3))

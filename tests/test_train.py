@@ -15,7 +15,7 @@ import pytest
 
 import maxent_jax
 from experiments import driver, train
-from maxent_jax import checkpoint, runs
+from maxent_jax import checkpoint, envs, runs
 from maxent_jax.config import preset
 
 ROOT = Path(__file__).parent.parent
@@ -166,16 +166,59 @@ def test_several_seeds_train_side_by_side(tmp_path):
     ("method", "period"), [("h", -1), ("la", 1), ("la", 10), ("la", 0), ("v", -1)]
 )
 def test_every_method_runs_on_both_backends(tmp_path, backend, method, period):
-    num_iterations = {"mujoco": 2, "mjx": 1}[backend]  # MJX takes 20 s an iteration on a CPU
+    num_iterations = {"mujoco": 2, "mjx": 1}[backend]
     config = preset(
         "smoke",
         backend=backend,
+        physics={"mujoco": "reference", "mjx": "fast"}[backend],  # for MJX is slow on a CPU
         method=method,
         refresh_period=period,
         num_iterations=num_iterations,
     )
     driver.train(config, tmp_path, time.perf_counter())  # in this process: compiled once
     assert [row["env_steps"] for row in runs.read_metrics(tmp_path)] == [400, 800][:num_iterations]
+
+
+def run_smoke(directory, env, backend, **changes):
+    config = preset("smoke", env=env, backend=backend, num_iterations=1, **changes)
+    with jax.numpy_rank_promotion("allow"), jax.legacy_prng_key("allow"):  # for brax
+        driver.train(config, directory, time.perf_counter())
+    (row,) = runs.read_metrics(directory)
+    assert row["env_steps"] == 400 and row["num_invalid"] == 0
+    assert maxent_jax.load_run(directory).histogram.sum() <= 400
+    assert (directory / "figures" / "fireworks.png").exists()
+
+
+@pytest.mark.parametrize("env", ["humanoid", "pendulum"])
+def test_every_environment_runs(tmp_path, env):
+    run_smoke(tmp_path, env, "auto")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("env", "backend"),
+    [
+        *(("mountain_car", "auto"), ("walker2d", "mujoco")),
+        *(("walker2d", "mjx"), ("humanoid", "mjx"), ("brax:halfcheetah", "auto")),
+        *(("ant", "warp"), ("walker2d", "warp"), ("humanoid", "warp")),
+    ],
+)
+def test_every_environment_runs_on_every_backend(tmp_path, env, backend):
+    if backend == "warp":
+        pytest.importorskip("warp", reason="warp-lang, an option for GPUs, is not installed")
+    run_smoke(tmp_path, env, backend)
+
+
+@pytest.mark.slow
+def test_an_environment_of_the_users_trains(tmp_path):
+    (tmp_path / "cart.xml").write_text(
+        """<mujoco><worldbody><body><joint name="rail" type="slide" axis="1 0 0"/>
+        <geom size="0.1" mass="1"/></body></worldbody>
+        <actuator><motor joint="rail" ctrlrange="-1 1" ctrllimited="true"/></actuator></mujoco>"""
+    )
+    make = lambda backend, physics: envs.from_xml(tmp_path / "cart.xml", 5, backend, physics)
+    envs.register("cart", make)
+    run_smoke(tmp_path / "run", "user:cart", "mujoco")
 
 
 @pytest.mark.parametrize(
@@ -190,7 +233,8 @@ def test_every_method_runs_on_both_backends(tmp_path, backend, method, period):
         (("--num-iterations",), "--num-iterations"),
         (("--preset", "smoke", "--num-neighbors", "256"), "below reference-size = 256"),
         (("--preset", "smoke", "--batch-size", "4000"), "must not exceed replay-size"),
-        (("--backend", "warp"), "not part of this release"),
+        (("--env", "pendulum", "--backend", "mjx"), "pendulum has only: auto"),
+        (("--env", "walker2d", "--policy-inputs", "heading"), "no floating torso"),
         (("--out", "tests"), "already exists"),
         (("--out", "tests", "--resume"), "not the directory of a run"),
         (("--out", "README.md"), "already exists"),
@@ -245,7 +289,7 @@ def test_evaluate_says_when_there_is_no_checkpoint(tmp_path):
     assert "no complete checkpoint" in call("experiments.evaluate", tmp_path, expect=2).stderr
 
 
-@pytest.mark.parametrize("module", ["knn", "envs", "sac", "forward_velocity"])
+@pytest.mark.parametrize("module", ["knn", "envs", "physics", "sac", "forward_velocity"])
 def test_a_benchmark_ends_with_json_rows(module):
     printed = call(f"benchmarks.{module}", "--toy").stdout.splitlines()
     assert printed[0].startswith("# python")
@@ -267,7 +311,7 @@ def test_the_cache_folder_is_the_users_own(monkeypatch):
     environment = os.environ | {"XDG_CACHE_HOME": "elsewhere"}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     code = (
-        "import jax; from maxent_jax.cache import enable_compilation_cache as f; f();"
+        "import jax; from maxent_jax import runtime; runtime.prepare(False);"
         "print(jax.config.jax_compilation_cache_dir)"
     )
     done = subprocess.run(

@@ -1,5 +1,6 @@
 """Visits to the cells of a grid: the coverage and entropy that the paper reports."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -9,10 +10,18 @@ import jax.numpy as jnp
 class Grid(NamedTuple):
     """Cells of equal size over two coordinates of the state. Static and hashable."""
 
-    coordinates: tuple[int, int]  # of the state
-    low: tuple[float, float]  # metres
-    high: tuple[float, float]  # metres
+    names: tuple[str, str]  # of the coordinates, with their units
+    low: tuple[float, float]
+    high: tuple[float, float]
     bins: tuple[int, int]
+    coordinates: tuple[int, int] = (0, 1)  # of the state, or of its transform
+    transform: Callable[[jax.Array], jax.Array] | None = None  # [..., D] -> [..., at least 2]
+
+
+def locate(states: jax.Array, grid: Grid) -> jax.Array:
+    """[..., 2]: the grid's coordinates of states [..., D]."""
+    located = grid.transform(states) if grid.transform else states
+    return located[..., jnp.array(grid.coordinates)]
 
 
 def count(states: jax.Array, grid: Grid, weights: jax.Array | None = None) -> jax.Array:
@@ -26,7 +35,7 @@ def count(states: jax.Array, grid: Grid, weights: jax.Array | None = None) -> ja
       [bins, bins] in the weights' dtype, else int32. States off the grid, and NaN, are dropped.
     """
     weights = jnp.ones(states.shape[0], jnp.int32) if weights is None else weights
-    position = states[:, jnp.array(grid.coordinates)]
+    position = locate(states, grid)
     low, high, bins = (jnp.array([x], jnp.float32) for x in (grid.low, grid.high, grid.bins))
     cell = jnp.floor((position - low) / (high - low) * bins)
     cell = jnp.minimum(cell, bins - 1)  # the upper edge, and what rounds up to it

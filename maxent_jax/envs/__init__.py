@@ -1,31 +1,157 @@
-"""Where states come from. `make(name)` gives a brax Env; base.py runs many of them at once."""
+"""Where states come from. `make(name)` gives a brax Env; base.py runs many of them at once.
+
+A name is one of Gymnasium's tasks or the classic ones (ENVS), `brax:NAME` for any environment of
+brax's, or `user:NAME` for one that `register` was told of.
+"""
 
 import contextlib
+import functools
 import io
-from typing import Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an option, is missing
     import mujoco.mjx  # noqa: F401
 
-from maxent_jax.envs import ant
-from maxent_jax.envs.task import MujocoEnv
+from brax import envs as brax_envs
+from brax.envs.base import Env
 
-TASKS = {task.name: task for task in (ant.TASK,)}
+from maxent_jax.config import ConfigError, check_env, check_physics
+from maxent_jax.density.histogram import Grid
+from maxent_jax.envs import ant, humanoid, mountain_car, pendulum, walker2d
+from maxent_jax.envs.physics import REFERENCE, Options, PhysicsState
+from maxent_jax.envs.task import MujocoEnv, Task, uniform_reset
+from maxent_jax.envs.torso import Torso
+from maxent_jax.types import Features
+
+TASKS = {task.name: task for task in (ant.TASK, walker2d.TASK, humanoid.TASK)}
+CLASSIC = {
+    "pendulum": (pendulum.Pendulum, pendulum.GRID),
+    "mountain_car": (mountain_car.MountainCar, mountain_car.GRID),
+}
+BRAX_HIDES_POSITION = ("ant", "halfcheetah", "hopper", "humanoid", "swimmer", "walker2d")
+DEFAULT_GRID = Grid(
+    names=("state 0", "state 1"), low=(-10.0, -10.0), high=(10.0, 10.0), bins=(100, 100)
+)
 
 
-def make(
-    name: str, backend: str = "auto", physics: str = "reference", **deviations: Any
-) -> MujocoEnv:
+class Entry(NamedTuple):
+    """How an environment is made, and what is known of it beside."""
+
+    make: Callable[..., Env]  # backend, physics, **deviations -> Env
+    grid: Grid  # where coverage and histogram entropy are measured
+    torso: Torso | None = None
+    phi: Features | None = None  # its feature map; None: see features.make_feature_map
+
+
+_registered: dict[str, Entry] = {}
+
+
+def make(name: str, backend: str = "auto", physics: str = "reference", **deviations: Any) -> Env:
     """The environment of that name.
 
     Args:
-      name: one of TASKS.
-      backend: "mjx", "mujoco" (C MuJoCo), or "auto": `mujoco` on a CPU, else `mjx`.
-      physics: "reference" (the XML's options) or "fast", see physics.load_model.
+      name: one of ENVS, "brax:NAME" or "user:NAME".
+      backend: "mjx", "mujoco" (C MuJoCo), "warp", or "auto": `mujoco` on a CPU, else `mjx`. The
+        classic ones know "auto" alone; brax's "auto" is brax's own default, and "mjx".
+      physics: "reference" (the XML's options) or, for Gymnasium's tasks, "fast": see the README.
       **deviations: from Gymnasium's task, see MujocoEnv.
     Raises:
-      ValueError: unknown name, backend or physics, or a backend that cannot run here.
+      ConfigError (a ValueError): an unknown name, backend or physics, or one that cannot run here.
     """
-    if name not in TASKS:
-        raise ValueError(f"unknown environment '{name}': choose one of {', '.join(TASKS)}")
-    return MujocoEnv(TASKS[name], backend, physics, **deviations)
+    found = entry(name)
+    check_physics(name, backend, physics)
+    return found.make(backend, physics, **deviations)
+
+
+def entry(name: str) -> Entry:
+    """How the environment of that name is made, its grid, torso and feature map.
+
+    Raises:
+      ConfigError: an unknown name.
+    """
+    check_env(name)
+    kind, _, rest = name.rpartition(":")
+    if kind == "brax":
+        return Entry(functools.partial(_make_brax, rest), DEFAULT_GRID)
+    if kind == "user":
+        if name not in _registered:
+            raise ConfigError(
+                f"environment '{name}' is not registered: call maxent_jax.envs.register first"
+            )
+        return _registered[name]
+    if name in TASKS:
+        task = TASKS[name]
+        return Entry(functools.partial(MujocoEnv, task), task.grid, task.torso)
+    make_classic, grid = CLASSIC[name]
+    return Entry(functools.partial(_make_classic, make_classic), grid)
+
+
+def register(
+    name: str,
+    make: Callable[..., Env],
+    grid: Grid = DEFAULT_GRID,
+    phi: Features | None = None,
+) -> None:
+    """Makes an environment of the user's known as `user:NAME`, to be trained like any other.
+
+    Args:
+      make: backend, physics -> a brax Env, whose observation is [D], D at least 2, and whose
+        action lies in [-1, 1]. The reward is not used; `done` ends an episode as a terminal.
+      grid: where coverage is measured; by default the first two observations, within ±10.
+      phi: the feature map, [..., D] -> [..., F], with `.names`; by default the first two
+        observations and five random projections of the others.
+    """
+    _registered[f"user:{name}"] = Entry(make, grid, None, phi)
+
+
+def from_xml(
+    xml: str | Path,
+    frame_skip: int,
+    backend: str = "auto",
+    physics: str | Options = REFERENCE,
+    reset_noise: float = 1e-2,
+    healthy: Callable | None = None,
+) -> MujocoEnv:
+    """An environment of any MJCF file: it observes qpos and qvel, and acts by its controls.
+
+    Args:
+      frame_skip: the file's physics steps in a control step.
+      reset_noise: half the range of the noise in every coordinate of a start.
+      healthy: observation [..., D] -> [...] bool, false ends an episode; by default only numbers
+        that are not finite do.
+    Raises:
+      ConfigError: MuJoCo cannot read the file, or the backend cannot simulate it.
+    """
+    task = Task(
+        name=Path(xml).stem,
+        xml=Path(xml),
+        frame_skip=frame_skip,
+        reset=uniform_reset(reset_noise),
+        observe=_qpos_and_qvel,
+        healthy=healthy or _finite,
+        grid=DEFAULT_GRID,
+    )
+    return MujocoEnv(task, backend, physics)
+
+
+def _qpos_and_qvel(state: PhysicsState, _) -> Any:
+    return jnp.concatenate([state.qpos, state.qvel], axis=-1)
+
+
+def _finite(observation: Any) -> Any:
+    return jnp.isfinite(observation).all(-1)
+
+
+def _make_classic(kind: Callable[[], Env], _backend: str, _physics: str) -> Env:
+    return kind()
+
+
+def _make_brax(name: str, backend: str, _physics: str) -> Env:
+    options: dict[str, Any] = {} if backend == "auto" else {"backend": backend}
+    if name in BRAX_HIDES_POSITION:
+        options["exclude_current_positions_from_observation"] = False
+    return brax_envs.get_environment(name, **options)

@@ -1,32 +1,37 @@
 """A MuJoCo task is data and a few pure functions; one brax Env runs any of them."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import mujoco
 from brax.envs.base import Env, State
 
+from maxent_jax.config import BACKENDS, PHYSICS, ConfigError, unknown
 from maxent_jax.density.histogram import Grid
-from maxent_jax.envs import physics
+from maxent_jax.envs import mjx_backend, mujoco_backend, physics
+from maxent_jax.envs.physics import Derived, Options, PhysicsState
+from maxent_jax.envs.torso import Torso
 
 
 class Task(NamedTuple):
-    """What tells one environment from another.
+    """What tells one MuJoCo environment from another.
 
-    Functions take and give single or batched observations, [..., D].
+    Functions of an observation take and give single or batched ones, [..., D].
     """
 
     name: str
-    xml: str  # in gymnasium/envs/mujoco/assets
-    frame_skip: int  # physics steps in a control step
-    reset: Callable[[jax.Array, physics.PhysicsState], physics.PhysicsState]  # key, rest -> start
-    observe: Callable[[physics.PhysicsState], jax.Array]
+    xml: Path
+    frame_skip: int  # the XML's physics steps in a control step
+    reset: Callable[[jax.Array, PhysicsState], PhysicsState]  # key, rest -> start
+    observe: Callable[[PhysicsState, Derived], jax.Array]
     healthy: Callable[[jax.Array], jax.Array]  # -> [...] bool
-    flipped: Callable[[jax.Array], jax.Array]  # -> [...] bool: upside down
-    heading_inputs: Callable[[jax.Array], jax.Array]  # -> [..., I], see ant.heading_inputs
-    rotate: Callable[[jax.Array, jax.Array], jax.Array]  # turn the world about the vertical
     grid: Grid  # where coverage and histogram entropy are measured
+    derived: tuple[str, ...] = ()  # fields that it observes beside the state
+    torso: Torso | None = None
+    fast: Options = physics.REFERENCE  # of the profile `fast`
 
 
 class MujocoEnv(Env):
@@ -34,27 +39,37 @@ class MujocoEnv(Env):
 
     Args:
       task: which environment.
-      backend: "auto", "mjx" or "mujoco".
-      profile: "reference" or "fast", see physics.load_model.
+      backend: "auto", "mjx", "mujoco" or "warp".
+      profile: "reference" (the XML's options), "fast" (the task's), or Options.
       torque_limit: share of the control range that an action of 1 uses. Below 1 it departs from
         Gymnasium.
       end_flipped: also end an episode once the torso is upside down. Departs from Gymnasium.
+    Raises:
+      ConfigError: an unknown backend or profile, or one that cannot run the task here.
     """
 
     def __init__(
         self,
         task: Task,
         backend: str = "auto",
-        profile: str = "reference",
+        profile: str | Options = "reference",
         torque_limit: float = 1.0,
         end_flipped: bool = False,
     ):
         self.task = task
-        self.model = physics.load_model(task.xml, profile)
-        self.dt = self.model.opt.timestep * task.frame_skip
+        self._backend = resolve_backend(backend)
+        options = _options(task, profile)
+        self.model = physics.load_model(task.xml, options)
+        """The simulated model, MuJoCo's own."""
+        _check(task, self.model, end_flipped)
+        num_substeps = task.frame_skip * options.substeps
+        self.dt = self.model.opt.timestep * num_substeps
         """Seconds in a control step."""
-        self._backend = physics.resolve_backend(backend)
-        self._step = physics.make_step(self.model, self._backend, task.frame_skip)
+        if self._backend == "mujoco":
+            self._physics = mujoco_backend.make(self.model, num_substeps, task.derived)
+        else:
+            impl = {"mjx": "jax", "warp": "warp"}[self._backend]
+            self._physics = mjx_backend.make(self.model, num_substeps, task.derived, impl)
         low, high = self.model.actuator_ctrlrange.T
         self._control_center = jnp.asarray((high + low) / 2, jnp.float32)
         self._control_span = jnp.asarray((high - low) / 2 * torque_limit, jnp.float32)
@@ -63,12 +78,12 @@ class MujocoEnv(Env):
     def reset(self, rng: jax.Array) -> State:
         """A fresh random start, single; vmap it over keys for more."""
         nv = self.model.nv
-        rest = physics.PhysicsState(
+        rest = PhysicsState(
             jnp.asarray(self.model.qpos0, jnp.float32), jnp.zeros(nv), jnp.zeros(nv)
         )
         start = self.task.reset(rng, rest)
         zero = jnp.zeros(())
-        return State(start, self.task.observe(start), zero, zero)
+        return State(start, self.task.observe(start, self._physics.derive(start)), zero, zero)
 
     def step(self, state: State, action: jax.Array) -> State:
         """One control step, single; an action in [-1, 1] spans the control range.
@@ -76,14 +91,14 @@ class MujocoEnv(Env):
         Raises:
           ValueError: an action of the wrong size.
         """
-        if action.shape[-1:] != (self.action_size,):
-            raise ValueError(f"action has shape {action.shape}, expected [{self.action_size}]")
+        check_action(self, action)
         control = self._control_center + self._control_span * jnp.clip(action, -1, 1)
-        after = self._step(state.pipeline_state, control)
-        observation = self.task.observe(after)
+        after, derived = self._physics.step(state.pipeline_state, control)
+        observation = self.task.observe(after, derived)
         healthy = self.task.healthy(observation)
         if self._end_flipped:
-            healthy &= ~self.task.flipped(observation)
+            assert self.task.torso is not None
+            healthy &= ~self.task.torso.flipped(observation)
         return state.replace(
             pipeline_state=after, obs=observation, done=1.0 - healthy.astype(jnp.float32)
         )
@@ -100,5 +115,55 @@ class MujocoEnv(Env):
 
     @property
     def backend(self) -> str:
-        """What simulates: mjx or mujoco."""
+        """What simulates: mjx, mujoco or warp."""
         return self._backend
+
+
+def resolve_backend(backend: str) -> str:
+    """The backend that runs: "auto" is `mujoco` on a CPU and `mjx` on anything else.
+
+    Raises:
+      ConfigError: unknown backend.
+    """
+    if backend not in BACKENDS:
+        raise ConfigError(unknown("backend", backend, BACKENDS))
+    if backend == "auto":
+        return "mujoco" if jax.default_backend() == "cpu" else "mjx"
+    return backend
+
+
+def check_action(env: Env, action: jax.Array) -> None:
+    """Raises ValueError on an action whose last axis is not [A]."""
+    if action.shape[-1:] != (env.action_size,):
+        raise ValueError(f"action has shape {action.shape}, expected [{env.action_size}]")
+
+
+def uniform_reset(noise: float) -> Callable[[jax.Array, PhysicsState], PhysicsState]:
+    """Gymnasium's usual start: the rest pose with uniform noise in every coordinate."""
+
+    def reset(key: jax.Array, rest: PhysicsState) -> PhysicsState:
+        key_qpos, key_qvel = jax.random.split(key)
+        draw = lambda key, like: jax.random.uniform(key, like.shape, minval=-noise, maxval=noise)
+        return rest._replace(
+            qpos=rest.qpos + draw(key_qpos, rest.qpos), qvel=draw(key_qvel, rest.qvel)
+        )
+
+    return reset
+
+
+def _options(task: Task, profile: str | Options) -> Options:
+    if isinstance(profile, Options):
+        return profile
+    if profile not in PHYSICS:
+        raise ConfigError(unknown("physics", profile, PHYSICS))
+    return task.fast if profile == "fast" else physics.REFERENCE
+
+
+def _check(task: Task, model: mujoco.MjModel, end_flipped: bool) -> None:
+    if model.na:
+        raise ConfigError(
+            f"{task.xml.name} has actuators with a state of their own (activations), which the "
+            "physics state here does not carry"
+        )
+    if end_flipped and task.torso is None:
+        raise ConfigError(f"{task.name} has no floating torso, so that nothing can be flipped")

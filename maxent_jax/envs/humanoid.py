@@ -1,0 +1,59 @@
+"""Humanoid: 17 torques, 13 bodies. Gymnasium's Humanoid-v4 with positions kept.
+
+| state      | what                                                       | unit         |
+|------------|------------------------------------------------------------|--------------|
+| 0, 1, 2    | torso x, y, z                                              | m            |
+| 3 .. 6     | torso orientation, quaternion (w, x, y, z)                 | -            |
+| 7 .. 23    | joint angles: abdomen, hips and knees, shoulders and elbows| rad          |
+| 24, 25, 26 | torso velocity in the world's axes                         | m/s          |
+| 27, 28, 29 | torso angular velocity in the torso's axes                 | rad/s        |
+| 30 .. 46   | joint velocities                                           | rad/s        |
+| 47 .. 186  | cinert: inertia (6), mass × offset (3), mass of each body  | kg m², kg m, kg |
+| 187 .. 270 | cvel: angular and linear velocity of each body             | rad/s, m/s   |
+| 271 .. 293 | qfrc_actuator: force along each degree of freedom          | N, N m       |
+| 294 .. 377 | cfrc_ext: torque and force on each body from contacts      | N m, N       |
+
+The world is one of the 14 bodies of the last fields; its entries are 0.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from maxent_jax.density.histogram import Grid
+from maxent_jax.envs import physics, task, torso
+from maxent_jax.envs.physics import Derived, Options, PhysicsState
+from maxent_jax.envs.task import Task
+
+HEALTHY_HEIGHT = (1.0, 2.0)  # metres, Humanoid-v4
+RESET_NOISE = 1e-2  # Humanoid-v4
+DERIVED = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
+
+
+def observe(state: PhysicsState, derived: Derived) -> jax.Array:
+    return jnp.concatenate([state.qpos, state.qvel, *(derived[name] for name in DERIVED)], axis=-1)
+
+
+def healthy(observation: jax.Array) -> jax.Array:
+    low, high = HEALTHY_HEIGHT
+    height = observation[..., 2]
+    return (height > low) & (height < high)
+
+
+TASK = Task(
+    name="humanoid",
+    xml=physics.gymnasium_xml("humanoid.xml"),
+    frame_skip=5,
+    reset=task.uniform_reset(RESET_NOISE),
+    observe=observe,
+    healthy=healthy,
+    grid=Grid(
+        names=("x (m)", "y (m)"),
+        coordinates=(0, 1),
+        low=(-10.0, -10.0),
+        high=(10.0, 10.0),
+        bins=(100, 100),
+    ),
+    derived=DERIVED,
+    fast=Options("Euler", iterations=4, ls_iterations=8, max_contacts=8),
+    torso=torso.make(num_positions=24, num_velocities=23, rotates=False),
+)

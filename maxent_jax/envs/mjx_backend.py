@@ -1,0 +1,133 @@
+"""Physics on the device: MuJoCo MJX, in jax or in Warp."""
+
+import contextlib
+import copy
+import importlib
+import importlib.util
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from mujoco import mjx
+from mujoco.mjx._src import collision_driver
+
+from maxent_jax.config import ConfigError
+from maxent_jax.envs.physics import Derived, Physics, PhysicsState
+
+WARP_CONTACTS = 2**17  # contacts that Warp has room for, all environments together
+WARP_CONSTRAINTS = 512  # rows of the constraint solver, for each environment
+
+
+def make(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...], impl: str) -> Physics:
+    """The model in MJX.
+
+    Args:
+      num_substeps: physics steps in a control step.
+      derived: fields of MjData to give beside the state.
+      impl: "jax" or "warp".
+    Raises:
+      ConfigError: Warp is not installed, or the model has a feature that MJX does not.
+    """
+    if impl == "warp":
+        if importlib.util.find_spec("warp") is None:
+            raise ConfigError(
+                "backend 'warp' needs the package warp-lang, which is in the extra 'cuda': "
+                "install it, or choose mjx or mujoco"
+            )
+        importlib.import_module("warp").config.quiet = True  # it reports each kernel it compiles
+    model = copy.copy(model)
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # MJX never resets
+    if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:  # which MJX does not have
+        model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    device_model, blank = _put(model, impl, needs_forces="cfrc_ext" in derived)
+
+    def single(state: PhysicsState, control: jax.Array) -> tuple[PhysicsState, Derived]:
+        qpos, qvel, warmstart = state
+        data = blank.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=control)
+        data = jax.lax.fori_loop(0, num_substeps, lambda _, d: mjx.step(device_model, d), data)
+        after = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
+        if "cfrc_ext" in derived and impl == "jax":  # Warp has computed it in its step
+            data = mjx.rne_postconstraint(device_model, data)
+        return after, _fields(data, derived)
+
+    def step(state: PhysicsState, control: jax.Array) -> tuple[PhysicsState, Derived]:
+        batched = single
+        for _ in control.shape[:-1]:
+            batched = jax.vmap(batched)
+        with jax.numpy_rank_promotion("allow"), _capsule_frames():  # MJX promotes ranks
+            return batched(state, control)
+
+    return Physics(step, _derive(model, derived))
+
+
+def _put(model: mujoco.MjModel, impl: str, needs_forces: bool) -> tuple[mjx.Model, mjx.Data]:
+    """The model on the device, and data at rest."""
+    try:
+        device_model = mjx.put_model(model, impl=impl)
+        if impl == "jax":
+            return device_model, mjx.make_data(device_model, impl=impl)
+        device_model = device_model.tree_replace({"opt._impl.run_rne_postconstraint": needs_forces})
+        sizes = dict(naconmax=WARP_CONTACTS, njmax=WARP_CONSTRAINTS)
+        return device_model, mjx.make_data(model, impl=impl, **sizes)
+    except NotImplementedError as error:
+        reason = str(error).splitlines()[0].rstrip(".")
+        name = model.names.split(b"\0")[0].decode()
+        raise ConfigError(f"MJX cannot simulate '{name}' ({reason}): use backend mujoco") from None
+
+
+def _derive(model: mujoco.MjModel, derived: tuple[str, ...]):
+    device_model = mjx.put_model(model, impl="jax")
+    blank = mjx.make_data(device_model, impl="jax")
+
+    def single(qpos: jax.Array, qvel: jax.Array) -> Derived:
+        data = blank.replace(qpos=qpos, qvel=qvel)
+        data = mjx.com_vel(
+            device_model, mjx.com_pos(device_model, mjx.kinematics(device_model, data))
+        )
+        return _fields(data, derived)
+
+    def derive(state: PhysicsState) -> Derived:
+        if not derived:
+            return {}
+        batched = single
+        for _ in state.qpos.shape[:-1]:
+            batched = jax.vmap(batched)
+        with jax.numpy_rank_promotion("allow"):
+            return batched(state.qpos, state.qvel)
+
+    return derive
+
+
+def _fields(data: mjx.Data, names: tuple[str, ...]) -> Derived:
+    public = ("cvel", "qfrc_actuator")
+    return {n: jnp.ravel(getattr(data if n in public else data._impl, n)) for n in names}
+
+
+@contextlib.contextmanager
+def _capsule_frames() -> Iterator[None]:
+    """While MJX is traced: friction at a capsule on a plane lies along the capsule, as in C.
+
+    MJX 3.17 takes the world's y-axis for a capsule within 30 degrees of the plane's normal. That
+    turns the pyramid of friction: one Ant step in ten ends 1 to 20 % off in velocity, and turning
+    the world is no symmetry any more. See google-deepmind/mujoco, issue 2774.
+    """
+    colliders = collision_driver._COLLISION_FUNC
+    pair = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CAPSULE)
+    original = colliders[pair]
+
+    def aligned(model, data, key, geoms):
+        distance, position, _ = original(model, data, key, geoms)
+        normal, axis = (data.geom_xmat[geom][..., 2] for geom in geoms.T)
+        along = axis - normal * jnp.sum(normal * axis, -1, keepdims=True)
+        length = jnp.linalg.norm(along, axis=-1, keepdims=True)
+        along = jnp.where(length > 0, along / length, jnp.array([1.0, 0.0, 0.0]))
+        frame = jnp.stack([normal, along, jnp.cross(normal, along)], axis=1)
+        return distance, position, jnp.repeat(frame, original.ncon, axis=0)
+
+    aligned.ncon = original.ncon  # type: ignore[attr-defined]
+    colliders[pair] = aligned
+    try:
+        yield
+    finally:
+        colliders[pair] = original

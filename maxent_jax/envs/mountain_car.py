@@ -1,0 +1,72 @@
+"""Mountain car: too weak an engine for its hill, in plain jax. MountainCarContinuous-v0's dynamics.
+
+| state | what              | unit         |
+|-------|-------------------|--------------|
+| 0     | position, in [-1.2, 0.6]  | -    |
+| 1     | velocity, in [-0.07, 0.07]| per step |
+
+Starts near the bottom of the valley, at rest. An episode ends at the goal, position 0.45, or at the
+time limit, 200 steps in the official MaxEnt-H experiments, which count visits to 12 × 11 cells.
+"""
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+
+from maxent_jax.density.histogram import Grid
+from maxent_jax.envs.task import check_action
+
+POSITION = (-1.2, 0.6)
+MAX_SPEED = 0.07
+POWER, GRAVITY = 0.0015, 0.0025
+GOAL = 0.45
+START = (-0.6, -0.4)
+GRID = Grid(
+    names=("position", "velocity"),
+    low=(POSITION[0], -MAX_SPEED),
+    high=(POSITION[1], MAX_SPEED),
+    bins=(12, 11),
+)
+
+
+class MountainCar(Env):
+    """A brax environment; its pipeline state is the observation."""
+
+    def reset(self, rng: jax.Array) -> State:
+        """At rest, somewhere in [-0.6, -0.4]."""
+        position = jax.random.uniform(rng, minval=START[0], maxval=START[1])
+        zero = jnp.zeros(())
+        start = jnp.stack([position, zero])
+        return State(start, start, zero, zero)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """One step, single; an action of 1 is the whole engine.
+
+        Raises:
+          ValueError: an action of the wrong size.
+        """
+        check_action(self, action)
+        position, velocity = state.pipeline_state
+        force = jnp.clip(action[0], -1, 1)
+        velocity = velocity + (force * POWER - GRAVITY * jnp.cos(3 * position))
+        velocity = jnp.clip(velocity, -MAX_SPEED, MAX_SPEED)
+        position = jnp.clip(position + velocity, *POSITION)
+        velocity = jnp.where((position == POSITION[0]) & (velocity < 0), 0.0, velocity)
+        after = jnp.stack([position, velocity])
+        reached = (position >= GOAL) & (velocity >= 0)
+        return state.replace(pipeline_state=after, obs=after, done=reached.astype(jnp.float32))
+
+    @property
+    def observation_size(self) -> int:
+        """D."""
+        return 2
+
+    @property
+    def action_size(self) -> int:
+        """A."""
+        return 1
+
+    @property
+    def backend(self) -> str:
+        """What simulates."""
+        return "jax"

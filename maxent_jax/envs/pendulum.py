@@ -1,0 +1,83 @@
+"""Pendulum: a rod on a hinge and one weak motor, in plain jax. Gymnasium's Pendulum-v1.
+
+| state | what             | unit  |
+|-------|------------------|-------|
+| 0, 1  | cos θ, sin θ; θ = 0 points up | - |
+| 2     | angular velocity, at most 8   | rad/s |
+
+Starts hanging at rest, as in the official MaxEnt-H experiments, which count visits to 8 × 8 cells
+of |θ| and angular velocity. It never ends before the time limit, there 200 steps.
+"""
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+
+from maxent_jax.density.histogram import Grid
+from maxent_jax.envs.task import check_action
+
+TIME_STEP = 0.05  # seconds
+GRAVITY, MASS, LENGTH = 10.0, 1.0, 1.0  # m/s², kg, m
+MAX_SPEED = 8.0  # rad/s
+MAX_TORQUE = 2.0  # N m
+
+
+def observe(angle_and_speed: jax.Array) -> jax.Array:
+    angle, speed = angle_and_speed
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle), speed])
+
+
+def absolute_angle_and_speed(observation: jax.Array) -> jax.Array:
+    """[..., 2]: |θ| in [0, π], and the angular velocity."""
+    cos, sin, speed = jnp.moveaxis(observation, -1, 0)
+    return jnp.stack([jnp.arctan2(jnp.abs(sin), cos), speed], axis=-1)
+
+
+GRID = Grid(
+    names=("|θ| (rad)", "angular velocity (rad/s)"),
+    low=(0.0, -MAX_SPEED),
+    high=(float(jnp.pi), MAX_SPEED),
+    bins=(8, 8),
+    transform=absolute_angle_and_speed,
+)
+
+
+class Pendulum(Env):
+    """A brax environment; its pipeline state is [θ in [-π, π], angular velocity]."""
+
+    def reset(self, rng: jax.Array) -> State:
+        """Hanging at rest, whatever the key."""
+        del rng
+        hanging, zero = jnp.array([jnp.pi, 0.0]), jnp.zeros(())
+        return State(hanging, observe(hanging), zero, zero)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """One step of 0.05 s, single; an action of 1 is the whole torque.
+
+        Raises:
+          ValueError: an action of the wrong size.
+        """
+        check_action(self, action)
+        angle, speed = state.pipeline_state
+        torque = MAX_TORQUE * jnp.clip(action[0], -1, 1)
+        pull = 3 * GRAVITY / (2 * LENGTH) * jnp.sin(angle) + 3 / (MASS * LENGTH**2) * torque
+        speed = jnp.clip(speed + pull * TIME_STEP, -MAX_SPEED, MAX_SPEED)
+        angle = angle + speed * TIME_STEP
+        angle = angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))  # else it loses precision
+        after = jnp.stack([angle, speed])
+        return state.replace(pipeline_state=after, obs=observe(after))
+
+    @property
+    def observation_size(self) -> int:
+        """D."""
+        return 3
+
+    @property
+    def action_size(self) -> int:
+        """A."""
+        return 1
+
+    @property
+    def backend(self) -> str:
+        """What simulates."""
+        return "jax"
