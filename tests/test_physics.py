@@ -228,6 +228,21 @@ def test_a_diverged_row_shows_and_harms_no_other(step, visited, poison, monkeypa
     assert_same_bits(step(*few), expected)  # nor does it leave anything behind
 
 
+def test_a_row_with_derived_fields_depends_on_no_other(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    task = envs.TASKS["humanoid"]
+    model = physics.load_model(task.xml)
+    states, controls = rows_of(random_run(task, model), slice(0, None, 20))
+    step = jax.jit(mujoco_backend.make(model, task.frame_skip, task.derived).step)
+    expected = step(states, controls)
+    poisoned = step(states._replace(qvel=states.qvel.at[3, 5].set(np.nan)), controls)
+    good = jnp.array([0, 1, 2, 4, 5, 6, 7, 8, 9])
+    assert_same_bits(rows_of(poisoned, good), rows_of(expected, good))
+    assert not np.isfinite(poisoned[0].qvel[3]).all()
+    backwards = jnp.arange(10)[::-1]
+    assert_same_bits(step(*rows_of((states, controls), backwards)), rows_of(expected, backwards))
+
+
 def test_scan_is_the_same_steps(step, visited):
     states, controls = rows_of(visited, slice(-8, None))
     many = jnp.stack([controls, -controls, 0.5 * controls])

@@ -4,7 +4,7 @@ import contextlib
 import copy
 import importlib
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -76,7 +76,9 @@ def _put(model: mujoco.MjModel, impl: str, needs_forces: bool) -> tuple[mjx.Mode
         raise ConfigError(f"MJX cannot simulate '{name}' ({reason}): use backend mujoco") from None
 
 
-def _derive(model: mujoco.MjModel, derived: tuple[str, ...]):
+def _derive(model: mujoco.MjModel, derived: tuple[str, ...]) -> Callable[[PhysicsState], Derived]:
+    if not derived:
+        return lambda state: {}
     device_model = mjx.put_model(model, impl="jax")
     blank = mjx.make_data(device_model, impl="jax")
 
@@ -88,8 +90,6 @@ def _derive(model: mujoco.MjModel, derived: tuple[str, ...]):
         return _fields(data, derived)
 
     def derive(state: PhysicsState) -> Derived:
-        if not derived:
-            return {}
         batched = single
         for _ in state.qpos.shape[:-1]:
             batched = jax.vmap(batched)

@@ -29,7 +29,6 @@ def make(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> 
     outputs = [*STATE, *derived]
     sizes = [getattr(scratch, name).size for name in outputs]
     simulate = _Threads(model, num_substeps, derived) if derived else _Batches(model, num_substeps)
-    look = _Threads(model, 0, derived)
 
     def call(simulator: Callable[[Rows], Rows], state: PhysicsState, control: jax.Array):
         leading = control.shape[:-1]
@@ -48,9 +47,11 @@ def make(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> 
     def step(state: PhysicsState, control: jax.Array) -> tuple[PhysicsState, Derived]:
         return call(simulate, state, control)
 
+    if not derived:
+        return Physics(step, lambda state: {})
+    look = _Threads(model, 0, derived)
+
     def derive(state: PhysicsState) -> Derived:
-        if not derived:
-            return {}
         return call(look, state, jnp.zeros((*state.qpos.shape[:-1], model.nu)))[1]
 
     return Physics(step, derive)
