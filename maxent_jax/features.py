@@ -63,7 +63,7 @@ def make_feature_map(env_name: str) -> Features:
         return own
     path = resources.files("maxent_jax") / "tables" / f"features_{env_name}.json"
     if not path.is_file():
-        return _default(envs.make(env_name).observation_size)
+        return _default(envs.observation_size(envs.make(env_name)))
     table = json.loads(path.read_text())
     return FeatureMap(
         coordinates=tuple(table["coordinates"]),

@@ -43,6 +43,6 @@ def _make(config: Config) -> Parts:
         if config.policy_inputs == "heading":
             assert entry.torso is not None  # checked by Config
             inputs = entry.torso.heading_inputs
-        sac = agent.make(config, env.observation_size, env.action_size, inputs)
+        sac = agent.make(config, envs.observation_size(env), env.action_size, inputs)
         phi = make_feature_map(config.env)
         return Parts(config, env, entry.grid, entry.torso, sac, phi)
