@@ -184,8 +184,8 @@ def survive(name: str, num_steps: int, num_envs: int) -> dict[str, Any]:
 
     scan_steps = jax.jit(lambda carry, keys: jax.lax.scan(step, carry, keys)[0])
     carry = base.init(env, num_envs, 4096, key_init), jnp.zeros(3, jnp.int32)
-    vector_steps = -(-num_steps // (num_envs * CHUNK))  # chunks, rounded up
-    for key in jax.random.split(key_steps, vector_steps):
+    num_chunks = -(-num_steps // (num_envs * CHUNK))  # rounded up
+    for key in jax.random.split(key_steps, num_chunks):
         carry = scan_steps(carry, jax.random.split(key, CHUNK))
     invalid, leaked, ended = carry[1].tolist()
     return common.progress(
@@ -193,7 +193,7 @@ def survive(name: str, num_steps: int, num_envs: int) -> dict[str, Any]:
             "benchmark": "physics",
             "env": name,
             "options": "fast",
-            "random_steps": vector_steps * num_envs * CHUNK,
+            "random_steps": num_chunks * num_envs * CHUNK,
             "not_finite_resets": invalid,
             "vector_steps_with_nan_observed": leaked,
             "episodes_ended": ended,

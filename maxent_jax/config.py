@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+from collections.abc import Collection
 from typing import Any
 
 MUJOCO_ENVS = ("ant", "walker2d", "humanoid")
@@ -298,8 +299,7 @@ def preset(name: str, **changes: Any) -> Config:
     Raises:
       ConfigError: an unknown preset, or a value that no run can have.
     """
-    if name not in PRESETS:
-        raise ConfigError(unknown("preset", name, PRESETS))
+    check_choice("preset", name, PRESETS)
     env = changes.get("env", Config.env)
     in_env = _IN_ENV.get((name, env), {})
     return Config(**{"preset": name, **PRESETS[name], **in_env, **changes})
@@ -308,15 +308,14 @@ def preset(name: str, **changes: Any) -> Config:
 def check_env(name: str) -> None:
     """Raises ConfigError unless an environment can have that name."""
     names = (*ENVS, *(f"brax:{env}" for env in BRAX_ENVS))
-    if name not in names and not name.startswith("user:"):
-        raise ConfigError(unknown("env", name, names))
+    if not name.startswith("user:"):
+        check_choice("env", name, names)
 
 
 def check_physics(env: str, backend: str, physics: str) -> None:
     """Raises ConfigError where the environment has no such backend or physics."""
-    for what, value, known in (("backend", backend, BACKENDS), ("physics", physics, PHYSICS)):
-        if value not in known:
-            raise ConfigError(unknown(what, value, known))
+    check_choice("backend", backend, BACKENDS)
+    check_choice("physics", physics, PHYSICS)
     if env in MUJOCO_ENVS or env.startswith("user:"):
         return
     backends = ("auto",) if env in CLASSIC_ENVS else ("auto", "mjx")
@@ -331,11 +330,13 @@ def _time_limit(env: str) -> tuple[int, str]:
     return steps, f"the time limit is not {steps} steps"
 
 
-def unknown(what: str, value: str, known: Any) -> str:
-    """The sentence for a value that is not among the known ones, naming the nearest."""
+def check_choice(what: str, value: str, known: Collection[str]) -> None:
+    """Raises ConfigError unless the value is among the known ones; it names the nearest."""
+    if value in known:
+        return
     nearest = difflib.get_close_matches(value, known, n=1, cutoff=0.4)
     hint = f"did you mean '{nearest[0]}'?" if nearest else f"choose one of {', '.join(known)}."
-    return f"unknown {what} '{value}': {hint}"
+    raise ConfigError(f"unknown {what} '{value}': {hint}")
 
 
 _CHOICES = {
@@ -367,8 +368,7 @@ def _check(config: Config) -> None:
     check_env(config.env)
     check_physics(config.env, config.backend, config.physics)
     for name, known in _CHOICES.items():
-        if getattr(config, name) not in known:
-            raise ConfigError(unknown(name.replace("_", "-"), getattr(config, name), known))
+        check_choice(name.replace("_", "-"), getattr(config, name), known)
     bounds = (
         (_AT_LEAST_ONE, lambda x: x >= 1, "at least 1"),
         (_POSITIVE, lambda x: 0 < x < float("inf"), "a positive number"),

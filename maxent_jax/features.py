@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from maxent_jax import envs
+from maxent_jax.envs.task import observation_size
 from maxent_jax.types import Features
 
 NUM_PROJECTIONS = 5
@@ -63,7 +64,7 @@ def make_feature_map(env_name: str) -> Features:
         return own
     path = resources.files("maxent_jax") / "tables" / f"features_{env_name}.json"
     if not path.is_file():
-        return _default(envs.observation_size(envs.make(env_name)))
+        return _default(observation_size(envs.make(env_name)))
     table = json.loads(path.read_text())
     return FeatureMap(
         coordinates=tuple(table["coordinates"]),

@@ -9,6 +9,7 @@ from maxent_jax import envs
 from maxent_jax.config import MUJOCO_ENVS, Config
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs.base import Env
+from maxent_jax.envs.task import observation_size
 from maxent_jax.envs.torso import Torso
 from maxent_jax.features import make_feature_map
 from maxent_jax.sac import agent
@@ -43,6 +44,6 @@ def _make(config: Config) -> Parts:
         if config.policy_inputs == "heading":
             assert entry.torso is not None  # checked by Config
             inputs = entry.torso.heading_inputs
-        sac = agent.make(config, envs.observation_size(env), env.action_size, inputs)
+        sac = agent.make(config, observation_size(env), env.action_size, inputs)
         phi = make_feature_map(config.env)
         return Parts(config, env, entry.grid, entry.torso, sac, phi)

@@ -116,7 +116,7 @@ def test_a_brax_environment_by_name(name, lenient):
     theirs = brax_envs.get_environment(name)
     assert env.action_size == theirs.action_size
     phi = features.make_feature_map(f"brax:{name}")
-    observation = np.arange(envs.observation_size(env), dtype=np.float32)
+    observation = np.arange(task.observation_size(env), dtype=np.float32)
     found = phi(observation)
     assert found.shape == (7,)
     np.testing.assert_array_equal(found[:2], observation[:2])
@@ -125,26 +125,25 @@ def test_a_brax_environment_by_name(name, lenient):
 def test_a_brax_environment_observes_its_position(lenient):
     env = envs.make("brax:halfcheetah")
     theirs = brax_envs.get_environment("halfcheetah")
-    assert envs.observation_size(env) == envs.observation_size(theirs) + 1
+    assert task.observation_size(env) == task.observation_size(theirs) + 1
 
 
 CART = """<mujoco model="cart"><option timestep="0.01"/><worldbody>
-    <body><joint type="slide" axis="1 0 0"/><geom size="0.1" mass="1" contype="0" conaffinity="0"/>
-    {more}</body></worldbody><actuator>{actuator}</actuator></mujoco>"""
-MOTOR = """<motor joint="{joint}" gear="2" ctrlrange="-3 3" ctrllimited="true"/>"""
+    <body><joint name="rail" type="slide" axis="1 0 0"/>
+    <geom size="0.1" mass="1" contype="0" conaffinity="0"/></body></worldbody>
+    <actuator>{actuator}</actuator></mujoco>"""
+MOTOR = '<motor joint="rail" gear="2" ctrlrange="-3 3" ctrllimited="true"/>'
 
 
-def cart(tmp_path, more="", actuator=None):
-    text = CART.format(more=more, actuator=actuator or "")
-    text = text.replace('<joint type="slide"', '<joint name="rail" type="slide"')
+def cart(tmp_path, actuator=MOTOR):
     path = tmp_path / "cart.xml"
-    path.write_text(text)
+    path.write_text(CART.format(actuator=actuator))
     return path
 
 
 @pytest.mark.parametrize("backend", ["mujoco", "mjx"])
 def test_any_xml_can_be_an_environment(tmp_path, backend):
-    path = cart(tmp_path, actuator=MOTOR.format(joint="rail"))
+    path = cart(tmp_path)
     env = envs.from_xml(path, frame_skip=2, backend=backend, reset_noise=0.0)
     assert (env.observation_size, env.action_size) == (2, 1)
     assert env.dt == pytest.approx(0.02)
@@ -172,11 +171,11 @@ def test_what_mjx_cannot_load_is_named(tmp_path):
 def test_actuators_with_a_state_are_refused(tmp_path):
     integrator = '<general joint="rail" dyntype="integrator" ctrlrange="-1 1"/>'
     with pytest.raises(ConfigError, match="activations"):
-        envs.from_xml(cart(tmp_path, actuator=integrator), frame_skip=1, backend="mujoco")
+        envs.from_xml(cart(tmp_path, integrator), frame_skip=1, backend="mujoco")
 
 
 def test_an_environment_of_the_users_is_known_by_name(tmp_path):
-    path = cart(tmp_path, actuator=MOTOR.format(joint="rail"))
+    path = cart(tmp_path)
     grid = Grid(names=("x (m)", "v (m/s)"), low=(-1, -1), high=(1, 1), bins=(5, 5))
     make = functools.partial(envs.from_xml, path, 2)
     envs.register("cart", lambda backend, physics: make(backend, physics), grid)

@@ -1,7 +1,5 @@
 """The physics step: the backends against each other, and what makes it a pure function."""
 
-import importlib.util
-
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -93,9 +91,9 @@ BOUNDS = [
     ("mjx", "humanoid", EULER, 1e-5, 1e-4),
     pytest.param("mjx", "walker2d", NEWTON, 1e-5, 1e-3, marks=pytest.mark.slow),
     pytest.param("mjx", "humanoid", NEWTON, 1e-5, 1e-4, marks=pytest.mark.slow),
-    pytest.param("warp", "ant", NEWTON, 1e-6, 0.3, marks=pytest.mark.slow),
-    pytest.param("warp", "walker2d", NEWTON, 1e-5, 1e-3, marks=pytest.mark.slow),
-    pytest.param("warp", "humanoid", NEWTON, 1e-5, 1e-4, marks=pytest.mark.slow),
+    pytest.param("warp", "ant", NEWTON, 1e-6, 0.3, marks=pytest.mark.warp),
+    pytest.param("warp", "walker2d", NEWTON, 1e-5, 1e-3, marks=pytest.mark.warp),
+    pytest.param("warp", "humanoid", NEWTON, 1e-5, 1e-4, marks=pytest.mark.warp),
 ]
 # Of the derived fields, relative to the largest entry of each.
 DERIVED_BOUNDS = {"cinert": 1e-6, "cvel": 1e-5, "qfrc_actuator": 1e-7, "cfrc_ext": 1e-3}
@@ -103,8 +101,6 @@ DERIVED_BOUNDS = {"cinert": 1e-6, "cvel": 1e-5, "qfrc_actuator": 1e-7, "cfrc_ext
 
 @pytest.mark.parametrize(("backend", "name", "options", "median", "high"), BOUNDS)
 def test_the_backends_agree(backend, name, options, median, high):
-    if backend == "warp" and importlib.util.find_spec("warp") is None:
-        pytest.skip("warp-lang, an option for GPUs, is not installed")
     task = envs.TASKS[name]
     model = physics.load_model(task.xml, options)
     states, controls = random_run(task, model)
@@ -273,8 +269,7 @@ def options_that_differ(theirs, ours):
 
 @pytest.mark.parametrize("name", envs.TASKS)
 def test_the_reference_is_gymnasiums_file_but_for_automatic_resets(name):
-    xml = {"ant": "ant", "walker2d": "walker2d", "humanoid": "humanoid"}[name]
-    path = f"{gymnasium.__path__[0]}/envs/mujoco/assets/{xml}.xml"
+    path = f"{gymnasium.__path__[0]}/envs/mujoco/assets/{name}.xml"
     theirs, ours = mujoco.MjModel.from_xml_path(path), physics.load_model(envs.TASKS[name].xml)
     assert options_that_differ(theirs.opt, ours.opt) == {"disableflags"}
     assert ours.opt.disableflags == theirs.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_AUTORESET

@@ -200,13 +200,16 @@ def test_every_environment_runs(tmp_path, env):
     [
         *(("mountain_car", "auto"), ("walker2d", "mujoco")),
         *(("walker2d", "mjx"), ("humanoid", "mjx"), ("brax:halfcheetah", "auto")),
-        *(("ant", "warp"), ("walker2d", "warp"), ("humanoid", "warp")),
     ],
 )
 def test_every_environment_runs_on_every_backend(tmp_path, env, backend):
-    if backend == "warp":
-        pytest.importorskip("warp", reason="warp-lang, an option for GPUs, is not installed")
     run_smoke(tmp_path, env, backend)
+
+
+@pytest.mark.warp
+@pytest.mark.parametrize("env", ["ant", "walker2d", "humanoid"])
+def test_every_robot_runs_on_warp(tmp_path, env):
+    run_smoke(tmp_path, env, "warp")
 
 
 @pytest.mark.slow

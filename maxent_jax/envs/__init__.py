@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an option, is missing
@@ -89,11 +88,6 @@ def entry(name: str) -> Entry:
         return Entry(functools.partial(MujocoEnv, task), task.grid, task.torso)
     make_classic, grid = CLASSIC[name]
     return Entry(functools.partial(_make_classic, make_classic), grid)
-
-
-def observation_size(env: Env) -> int:
-    """D, by shapes alone: brax's own `observation_size` runs the simulator."""
-    return jax.eval_shape(env.reset, jax.random.key(0)).obs.shape[-1]
 
 
 def register(

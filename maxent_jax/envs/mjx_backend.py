@@ -52,11 +52,8 @@ def make(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...], imp
         return after, _fields(data, derived)
 
     def step(state: PhysicsState, control: jax.Array) -> tuple[PhysicsState, Derived]:
-        batched = single
-        for _ in control.shape[:-1]:
-            batched = jax.vmap(batched)
         with jax.numpy_rank_promotion("allow"), _capsule_frames():  # MJX promotes ranks
-            return batched(state, control)
+            return _batched(single, control.ndim - 1)(state, control)
 
     return Physics(step, _derive(model, derived))
 
@@ -90,13 +87,17 @@ def _derive(model: mujoco.MjModel, derived: tuple[str, ...]) -> Callable[[Physic
         return _fields(data, derived)
 
     def derive(state: PhysicsState) -> Derived:
-        batched = single
-        for _ in state.qpos.shape[:-1]:
-            batched = jax.vmap(batched)
         with jax.numpy_rank_promotion("allow"):
-            return batched(state.qpos, state.qvel)
+            return _batched(single, state.qpos.ndim - 1)(state.qpos, state.qvel)
 
     return derive
+
+
+def _batched(function: Callable, num_axes: int) -> Callable:
+    """The function over so many leading axes."""
+    for _ in range(num_axes):
+        function = jax.vmap(function)
+    return function
 
 
 def _fields(data: mjx.Data, names: tuple[str, ...]) -> Derived:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 from brax.envs.base import Env, State
 
-from maxent_jax.config import BACKENDS, PHYSICS, ConfigError, unknown
+from maxent_jax.config import BACKENDS, PHYSICS, ConfigError, check_choice
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import mjx_backend, mujoco_backend, physics
 from maxent_jax.envs.physics import Derived, Options, PhysicsState
@@ -106,7 +106,7 @@ class MujocoEnv(Env):
     @property
     def observation_size(self) -> int:
         """D."""
-        return jax.eval_shape(self.reset, jax.random.key(0)).obs.shape[-1]
+        return observation_size(self)
 
     @property
     def action_size(self) -> int:
@@ -125,11 +125,15 @@ def resolve_backend(backend: str) -> str:
     Raises:
       ConfigError: unknown backend.
     """
-    if backend not in BACKENDS:
-        raise ConfigError(unknown("backend", backend, BACKENDS))
+    check_choice("backend", backend, BACKENDS)
     if backend == "auto":
         return "mujoco" if jax.default_backend() == "cpu" else "mjx"
     return backend
+
+
+def observation_size(env: Env) -> int:
+    """D, by shapes alone: brax's own `observation_size` runs the simulator."""
+    return jax.eval_shape(env.reset, jax.random.key(0)).obs.shape[-1]
 
 
 def check_action(env: Env, action: jax.Array) -> None:
@@ -154,8 +158,7 @@ def uniform_reset(noise: float) -> Callable[[jax.Array, PhysicsState], PhysicsSt
 def _options(task: Task, profile: str | Options) -> Options:
     if isinstance(profile, Options):
         return profile
-    if profile not in PHYSICS:
-        raise ConfigError(unknown("physics", profile, PHYSICS))
+    check_choice("physics", profile, PHYSICS)
     return task.fast if profile == "fast" else physics.REFERENCE
 
 
