@@ -113,11 +113,12 @@ def test_trajectories_stay_with_gymnasiums(env, reference, starts):
 def test_health_is_gymnasiums(name, env, reference, starts):
     random, num = np.random.default_rng(0), 1000
     qpos = np.tile(starts.pipeline_state.qpos[:1], (num, 1))
-    for coordinate, low, high in LIMITS[name]:
+    for i, (coordinate, low, high) in enumerate(LIMITS[name]):
         wide = random.uniform(low - 0.2, high + 0.2, num)
         near = random.choice([low, high], num) + random.uniform(-1e-5, 1e-5, num)
         qpos[:, coordinate] = np.where(random.uniform(size=num) < 0.5, wide, near)
-        qpos[:8, coordinate] = np.repeat(np.float32([low, high]), 4)
+        qpos[:16, coordinate] = starts.pipeline_state.qpos[0, coordinate]
+        qpos[8 * i : 8 * i + 8, coordinate] = np.repeat(np.float32([low, high]), 4)
     theirs = []
     for row in qpos:
         reference.data.qpos[:] = row

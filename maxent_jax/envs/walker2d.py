@@ -32,7 +32,8 @@ def observe(state: PhysicsState, _: Derived) -> jax.Array:
 def healthy(observation: jax.Array) -> jax.Array:
     height, pitch = observation[..., 1], observation[..., 2]
     (low, high), (back, front) = HEALTHY_HEIGHT, HEALTHY_PITCH
-    return (height > low) & (height < high) & (pitch > back) & (pitch < front)
+    # >= where Gymnasium has > : float32 rounds 0.8 up, so this is `> 0.8` of the exact number.
+    return (height >= low) & (height < high) & (pitch > back) & (pitch < front)
 
 
 TASK = Task(
