@@ -1,8 +1,10 @@
 """How many env steps a second does each physics backend make, and its peers?
 
-Random actions, without resets. Ours and bare `mujoco.rollout` start from the same states
-on the ground and take the same actions, so that beside each rate stands how far its motion departs
-from that of C MuJoCo: a solver that stops early is faster, and is not the same environment.
+Random actions. Ours and bare `mujoco.rollout` start from the same states on the ground and take the
+same actions without resets, so that beside each rate stands how far its motion departs from that of
+C MuJoCo: a solver that stops early is faster, and is not the same environment. Gymnasium and
+EnvPool reset whoever falls, and robots that lie cost more than robots that stand: they compare with
+our row `episodes`, which does so too.
 """
 
 import functools
@@ -20,7 +22,7 @@ from mujoco import rollout
 from benchmarks import common
 from maxent_jax import envs, runtime
 from maxent_jax.config import PHYSICS
-from maxent_jax.envs import physics
+from maxent_jax.envs import base, physics
 from maxent_jax.envs.task import MujocoEnv
 
 # Random actions before a workload starts: an ant has landed, the others have not fallen yet.
@@ -28,6 +30,7 @@ SETTLE_STEPS = {"ant": 40, "walker2d": 5, "humanoid": 5}
 MIN_STEPS = DRIFT_STEPS = 50  # of each env
 MUJOCO_STEPS = 6400  # of all envs together, at least; C MuJoCo is too fast for fewer
 SEED = 0
+EPISODE_LENGTH, NUM_STARTS = 1000, 4096  # as in training
 GYMNASIUM = {"ant": "Ant-v4", "walker2d": "Walker2d-v4", "humanoid": "Humanoid-v4"}
 
 
@@ -87,6 +90,26 @@ def ours(workload: Workload, repeats: int) -> Measurement:
     positions = np.asarray(program(*inputs)[1])[..., : workload.env.model.nq]
     extra = {"compile_seconds": compile_seconds}
     return Measurement(workload.num_steps / seconds, positions, extra)
+
+
+def with_episodes(workload: Workload, repeats: int) -> Measurement:
+    """Ours as training runs it: whoever falls or becomes too old starts anew."""
+    actions = jnp.asarray(workload.actions)
+    keys = jax.random.split(jax.random.key(SEED), len(actions))
+
+    def run(episodes, actions, keys):
+        def step(episodes, inputs):
+            return base.step(workload.env, episodes, inputs[0], EPISODE_LENGTH, inputs[1])
+
+        _, transitions = jax.lax.scan(step, episodes, (actions, keys))
+        return transitions.next_observation
+
+    key = jax.random.key(SEED)
+    init = jax.jit(base.init, static_argnums=(0, 1, 2))
+    episodes = init(workload.env, actions.shape[1], NUM_STARTS, key)
+    program, _ = common.compiled(run, episodes, actions, keys)
+    seconds = common.median_seconds(lambda: program(episodes, actions, keys), repeats)
+    return Measurement(workload.num_steps / seconds, None, {})
 
 
 def bare_rollout(workload: Workload, repeats: int) -> Measurement:
@@ -207,8 +230,12 @@ def measure(cases, peers, repeats: int) -> Iterator[dict[str, Any]]:
             for peer, module in peers:
                 found = peer.measure(module, workload, repeats)
                 yield row(peer.distribution, workload, found, ceilings[size])
+        settings = {"backend": backend, "physics": profile}
         found = ours(workload, repeats)
-        yield row("maxent_jax", workload, found, ceilings[size], backend=backend, physics=profile)
+        yield row("maxent_jax", workload, found, ceilings[size], **settings)
+        if backend == "mujoco":
+            found = with_episodes(workload, repeats)
+            yield row("maxent_jax, episodes", workload, found, ceilings[size], **settings)
 
 
 def main() -> None:

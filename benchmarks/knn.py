@@ -1,10 +1,12 @@
 """How many distances a second does the exact k-nearest-neighbour search make, and its peers?
 
 A tree looks at few of the pairs: its figure is the rate at which a search of all pairs would take
-as long. Queries and points are Gaussian.
+as long. Queries and points are Gaussian or, with --run, states that the mixture of a run visits.
+Ours builds what it needs within each search; a peer's index is timed apart and in sum.
 """
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -12,12 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import common
-from maxent_jax.density.knn import knn_distances
+from maxent_jax import analysis, runs
+from maxent_jax.density import native
+from maxent_jax.density.knn import by_blocks, knn_distances
 
 NUM_NEIGHBORS, NUM_FEATURES = 3, 7  # k and p of the paper
-QUERIES, POINTS = (64, 4096), (16_384, 65_536)
+SIZES = ((64, 16_384), (4096, 65_536), (4096, 1_000_000))  # queries, points
 SCAN_PAIRS = 100_000_000  # roughly how many pairs a scan visits, in at least two steps
+MAX_SETS = 50  # of queries
+MATRIX_PAIRS = 300_000_000  # what stores all distances is measured up to here: 1.2 GB
 NUM_CHECKED = 64  # queries whose distances are held against float64
+NUM_SEEDS = 4
+EPISODES = 20  # of each policy of a run, at a time
 
 Search = Callable[[jax.Array, jax.Array], jax.Array]  # [B, F], [M, F] -> [B, k]
 
@@ -25,6 +33,7 @@ Search = Callable[[jax.Array, jax.Array], jax.Array]  # [B, F], [M, F] -> [B, k]
 class Problem(NamedTuple):
     """Float32 on the host, where all peers but one take it from."""
 
+    data: str
     queries: np.ndarray  # [L, B, F]: a scan searches for a fresh set in each of its L steps
     points: np.ndarray  # [M, F]
 
@@ -42,15 +51,45 @@ class Measurement(NamedTuple):
     extra: dict[str, float]  # further columns
 
 
-def make_problem(num_queries: int, num_points: int) -> Problem:
-    rng = np.random.default_rng(0)
-    num_sets = max(2, SCAN_PAIRS // (num_queries * num_points))
-    queries = rng.standard_normal((min(num_sets, 50), num_queries, NUM_FEATURES), np.float32)
-    return Problem(queries, rng.standard_normal((num_points, NUM_FEATURES), np.float32))
+def num_rows(num_queries: int, num_points: int) -> int:
+    return num_sets(num_queries, num_points) * num_queries + num_points
+
+
+def num_sets(num_queries: int, num_points: int) -> int:
+    return min(MAX_SETS, max(2, SCAN_PAIRS // (num_queries * num_points)))
+
+
+def make_problem(data: str, rows: np.ndarray, num_queries: int, num_points: int) -> Problem:
+    """From rows [L, F] in random order: the first are the queries, those behind them the points."""
+    sets = num_sets(num_queries, num_points)
+    queries = rows[: sets * num_queries].reshape(sets, num_queries, NUM_FEATURES)
+    return Problem(data, queries, rows[-num_points:])
+
+
+def gaussian(num: int) -> np.ndarray:
+    return np.random.default_rng(0).standard_normal((num, NUM_FEATURES), np.float32)
+
+
+def visited(directory: Path, num: int) -> np.ndarray:
+    """Features [num, F] of states that the mixture of a run visits, in random order."""
+    run = analysis.load_run(directory)
+    found: list[np.ndarray] = []
+    while sum(map(len, found)) < num:
+        occupancy = run.occupancy(EPISODES, seed=len(found))
+        found.append(np.asarray(occupancy.features)[np.asarray(occupancy.alive)])
+    rows = np.concatenate(found)
+    return np.random.default_rng(0).permutation(rows)[:num].astype(np.float32)
 
 
 def ours(queries: jax.Array, points: jax.Array) -> jax.Array:
     return knn_distances(queries, points, NUM_NEIGHBORS)
+
+
+def in_xla(queries: jax.Array, points: jax.Array) -> jax.Array:
+    """Ours where there is no compiler."""
+    exclude = jnp.full(len(queries), -1, jnp.int32)
+    labels = jnp.arange(len(points), dtype=jnp.int32)
+    return by_blocks(NUM_NEIGHBORS, queries, points, exclude, labels, jnp.int32(len(points)))
 
 
 def top_k(queries: jax.Array, points: jax.Array) -> jax.Array:
@@ -81,6 +120,24 @@ def in_scan(search: Search, problem: Problem, repeats: int) -> Measurement:
     seconds = common.median_seconds(lambda: program(queries, points), repeats) / len(queries)
     found = np.asarray(program(queries, points)[0])
     return Measurement(seconds, found, {"compile_seconds": compile_seconds})
+
+
+def vmapped(search: Search, problem: Problem, repeats: int) -> Measurement:
+    """As seeds side by side use it: each with its own queries and points. Held against as many
+    single searches.
+    """
+    take = lambda rows: (
+        jnp.stack([jnp.asarray(rows)] * NUM_SEEDS) + jnp.arange(NUM_SEEDS)[:, None, None]
+    )
+    queries, points = take(problem.queries[0]), take(problem.points)
+    together, _ = common.compiled(jax.vmap(search), queries, points)
+    single, _ = common.compiled(search, queries[0], points[0])
+    pairs = [(queries[i], points[i]) for i in range(NUM_SEEDS)]
+    one_by_one = common.median_seconds(lambda: [single(*pair) for pair in pairs], repeats)
+    seconds = common.median_seconds(lambda: together(queries, points), repeats)
+    found = np.asarray(together(queries, points)[0])
+    extra = {"seeds": NUM_SEEDS, "over_single_searches": seconds / one_by_one}
+    return Measurement(seconds / NUM_SEEDS, found, extra)
 
 
 def prebuilt(
@@ -118,6 +175,13 @@ def faiss_flat(faiss, problem: Problem, repeats: int) -> Measurement:
     return prebuilt(build, search, problem, repeats)
 
 
+def jax_tree(jaxkd, problem: Problem, repeats: int) -> Measurement:
+    queries, points = jnp.asarray(problem.queries[0]), jnp.asarray(problem.points)
+    build = jax.jit(jaxkd.build_tree)
+    search = jax.jit(lambda tree: jaxkd.query_neighbors(tree, queries, k=NUM_NEIGHBORS)[1])
+    return prebuilt(lambda: build(points), search, problem, repeats)
+
+
 def sklearn_brute(neighbors, problem: Problem, repeats: int) -> Measurement:
     settings = {"n_neighbors": NUM_NEIGHBORS, "algorithm": "brute", "n_jobs": common.CORES}
     return prebuilt(
@@ -131,6 +195,7 @@ PEERS = (
     common.Peer("scipy", "scipy.spatial", scipy_tree),
     common.Peer("faiss-cpu", "faiss", faiss_flat),
     common.Peer("scikit-learn", "sklearn.neighbors", sklearn_brute),
+    common.Peer("jaxkd", "jaxkd", jax_tree),
 )
 
 
@@ -149,35 +214,56 @@ def measure(problem: Problem, peers, repeats: int) -> Iterator[dict[str, Any]]:
 
     def row(who: str, form: str, found: Measurement) -> dict[str, Any]:
         our_seconds.setdefault(form, found.seconds)
+        # A state that the points hold too is at distance 0, for all.
+        error = np.abs(found.distances[:NUM_CHECKED] - truth) / np.maximum(truth, 1e-6)
+        with_build = {}
+        if "build_seconds" in found.extra:
+            total = found.seconds + found.extra["build_seconds"]
+            with_build = {"ours_over_this_with_build": total / our_seconds[form]}
         return common.progress(
             {
                 "benchmark": "knn",
+                "data": problem.data,
                 "who": who,
                 "form": form,
                 "queries": problem.queries.shape[1],
                 "points": len(problem.points),
                 "gpair_per_second": problem.num_pairs / found.seconds / 1e9,
                 "ours_over_this": found.seconds / our_seconds[form],
-                "max_relative_error": float(
-                    np.max(np.abs(found.distances[:NUM_CHECKED] / truth - 1))
-                ),
+                **with_build,
+                "max_relative_error": float(np.max(error)),
                 **found.extra,
             }
         )
 
-    for who, search in (("maxent_jax", ours), ("jax.lax.top_k", top_k)):
+    searches = {"maxent_jax": ours}
+    if native.available():
+        searches["maxent_jax in XLA"] = in_xla
+    if problem.num_pairs <= MATRIX_PAIRS:
+        searches["jax.lax.top_k"] = top_k
+    for who, search in searches.items():
         yield row(who, "alone", alone(search, problem, repeats))
         yield row(who, "scan", in_scan(search, problem, repeats))
+    yield row("maxent_jax", "vmap", vmapped(ours, problem, repeats))
     for peer, module in peers:
         yield row(peer.distribution, "alone", peer.measure(module, problem, repeats))
 
 
 def main() -> None:
-    args = common.parser(__doc__).parse_args()
+    flags = common.parser(__doc__)
+    flags.add_argument("--run", type=Path, help="a run's directory, for states as they occur")
+    args = flags.parse_args()
+    if args.run is not None:
+        runs.read_config(args.run)
     common.print_versions(PEERS)
     peers = common.importable(PEERS)
-    sizes = [(8, 512)] if args.toy else [(b, m) for m in POINTS for b in QUERIES]
-    rows = [row for size in sizes for row in measure(make_problem(*size), peers, args.repeats)]
+    sizes = [(8, 512)] if args.toy else SIZES
+    most = max(num_rows(*size) for size in sizes)
+    clouds = {"gaussian": gaussian(most)}
+    if args.run is not None:
+        clouds["run"] = visited(args.run, most)
+    problems = [make_problem(data, clouds[data], *size) for data in clouds for size in sizes]
+    rows = [row for problem in problems for row in measure(problem, peers, args.repeats)]
     for row in rows:
         common.emit(row)
 

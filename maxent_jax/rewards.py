@@ -96,12 +96,41 @@ def hazan_reward(
     By Prop. 1 it is an affine map, of slope 1, of p log R: intercept
     log(N π^(p/2) / (k Γ(p/2 + 1))) - 1. Arguments as in knn_reward. Source: Eq. 10.
     """
+    return -_floored_log_density(features, reference, num_neighbors, exclude) - 1
+
+
+def renyi_reward(
+    features: jax.Array,
+    reference: jax.Array,
+    num_neighbors: int,
+    alpha: float,
+    exclude: jax.Array | None = None,
+) -> jax.Array:
+    """(α - 1) log p at a state, [B, F] -> [B] nats: high where few states are, if α < 1.
+
+    Up to the factor α / (1 - α) its exponential, p^(α - 1), is the gradient of ∫ p^α, whose
+    logarithm over 1 - α is Rényi's entropy; the smaller α, the more rare states count.
+
+    Args:
+      alpha: the order, in (0, 1); at 1 the entropy is Shannon's and this form is 0.
+      features, reference, num_neighbors, exclude: as in knn_reward.
+    Raises:
+      ValueError: M < k, or alpha outside (0, 1).
+    Source: Yuan et al. 2022 (RISE), whose R^(1 - α) leaves out the exponent p.
+    """
+    if not 0 < alpha < 1:
+        raise ValueError(f"alpha is {alpha}, but must lie between 0 and 1")
+    return (alpha - 1) * _floored_log_density(features, reference, num_neighbors, exclude)
+
+
+def _floored_log_density(features, reference, num_neighbors, exclude):
+    """[B] nats, bounded where a state is also a reference state."""
     num_points = jnp.asarray(reference.shape[0], jnp.float32)
     if exclude is not None:
         num_points = num_points - (exclude >= 0)
     distance = knn_distances(features, reference, num_neighbors, exclude)[:, -1]
     distance = jnp.maximum(distance, DISTANCE_FLOOR)
-    return -log_density(distance, num_points, num_neighbors, reference.shape[1]) - 1
+    return log_density(distance, num_points, num_neighbors, reference.shape[1])
 
 
 def shaped(

@@ -11,7 +11,8 @@ PACKAGE = Path(__file__).parent.parent / "maxent_jax"
 # The reading order of the package, first to last.
 ORDER = [
     *("types", "config", "runs", "runtime"),
-    *("density.histogram", "density.knn", "density.entropy", "density.reservoir"),
+    *("density.histogram", "density.native", "density.knn", "density.sharding"),
+    *("density.entropy", "density.reservoir"),
     *("envs.physics", "envs.mjx_backend", "envs.mujoco_backend", "envs.torso", "envs.task"),
     *("envs.ant", "envs.walker2d", "envs.humanoid", "envs.pendulum", "envs.mountain_car"),
     *("envs", "envs.base", "rollout", "features"),

@@ -79,6 +79,21 @@ def test_the_reward_of_hazan_is_what_one_computes_by_hand(k, exclude, expected):
     np.testing.assert_allclose(found, [np.log(expected) - 1], rtol=1e-6)
 
 
+@pytest.mark.parametrize("alpha", [0.1, 0.9])
+@pytest.mark.parametrize(("k", "exclude", "expected"), [(1, None, 8), (2, None, 16), (2, 0, 24)])
+def test_the_reward_of_renyi_is_what_one_computes_by_hand(alpha, k, exclude, expected):
+    reference = np.array([[1.0], [-4.0], [8.0], [99.0]], np.float32)
+    exclude = None if exclude is None else np.array([exclude], np.int32)
+    found = rewards.renyi_reward(np.zeros((1, 1), np.float32), reference, k, alpha, exclude)
+    np.testing.assert_allclose(found, [(1 - alpha) * np.log(expected)], rtol=1e-6)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0, -0.5, np.nan])
+def test_an_order_without_a_renyi_entropy_of_its_own_is_refused(alpha):
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        rewards.renyi_reward(np.zeros((2, 1), np.float32), np.ones((5, 1), np.float32), 1, alpha)
+
+
 @pytest.mark.parametrize("form", rewards.FORMS)
 @pytest.mark.parametrize("scale", [0.01, 0.3, 1.0, 5.0])
 def test_no_reward_is_infinite(form, scale):

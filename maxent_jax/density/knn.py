@@ -1,12 +1,17 @@
 """Exact distances to the k nearest points, on the device, without a distance matrix in memory.
 
-Queries lie in the SIMD lanes and keep their k smallest squared distances while blocks of points
-pass by. Distances are direct float32 differences: the expanded square loses the small ones.
+Distances are direct float32 differences: the expanded square loses the small ones, which matter
+most. One question, three answers that differ in speed alone: compiled C++ on a CPU (native), and
+two forms in XLA, by blocks of points for CPUs and by one reduction for GPUs.
 """
+
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from maxent_jax.density import native
 
 NONE_EXCLUDED = -1
 # Points handled at once, unrolled. Measured on two cores with AVX-512 inside a scan: few queries
@@ -24,6 +29,8 @@ def knn_distances(
 ) -> jax.Array:
     """Distances from each query to its k nearest points, ascending.
 
+    Usable inside jit, scan and vmap; not differentiable. Memory grows with B + M, not with B × M.
+
     Args:
       queries: [B, F] float32.
       points: [M, F] float32, same units.
@@ -31,9 +38,11 @@ def knn_distances(
       exclude: [B] int, the label of the points that a query must not see, -1 for none. It is how
         a query that is itself a point leaves itself out, also where others share its place.
       count: how many points, from the first, are filled; all of them when left out. May be traced.
-      labels: [M] int, what `exclude` names; a point's index when left out.
+      labels: [M] int but -1, what `exclude` names; a point's index when left out.
     Returns:
-      [B, k] distances in the units of F; inf where there are fewer than k neighbours.
+      [B, k] distances in the units of F; inf where there are fewer than k neighbours. Where values
+      are traced and so can't be refused: a point that is not finite is nobody's neighbour, and a
+      query that is not finite gets NaN.
     Raises:
       ValueError: k < 1, k > M, sizes that do not match, or concrete input that is not finite.
     """
@@ -41,12 +50,33 @@ def knn_distances(
     num_queries, num_points = queries.shape[0], points.shape[0]
     exclude = jnp.full(num_queries, NONE_EXCLUDED, jnp.int32) if exclude is None else exclude
     labels = jnp.arange(num_points, dtype=jnp.int32) if labels is None else labels
-    filled = jnp.arange(num_points) < (num_points if count is None else count)
-    # An empty slot lies at infinity, and its label matches no query.
-    points = jnp.where(filled[:, None], points, jnp.inf)
+    count = jnp.asarray(num_points if count is None else count, jnp.int32)
+    single = queries.dtype == points.dtype == jnp.float32
+    on_cpu = native.knn_distances if single and native.available() else by_blocks
+    return jax.lax.platform_dependent(
+        *(jnp.asarray(queries), jnp.asarray(points), exclude, labels, count),
+        cpu=functools.partial(on_cpu, k),
+        cuda=functools.partial(by_reduction, k),
+        rocm=functools.partial(by_reduction, k),
+        default=functools.partial(by_blocks, k),
+    )
 
-    block = SMALL_BLOCK if num_queries <= FEW_QUERIES else LARGE_BLOCK
-    padding = -num_points % block
+
+def by_blocks(
+    k: int,
+    queries: jax.Array,
+    points: jax.Array,
+    exclude: jax.Array,
+    labels: jax.Array,
+    count: jax.Array,
+) -> jax.Array:
+    """As knn_distances. Queries lie in the SIMD lanes and keep their k smallest squares while
+    blocks of points pass by.
+    """
+    # What is no neighbour lies at infinity, and its label matches no query.
+    points = jnp.where(_neighbors(points, count)[:, None], points, jnp.inf)
+    block = SMALL_BLOCK if queries.shape[0] <= FEW_QUERIES else LARGE_BLOCK
+    padding = -points.shape[0] % block
     points = jnp.pad(points, ((0, padding), (0, 0)), constant_values=jnp.inf)
     labels = jnp.pad(labels, (0, padding), constant_values=NONE_EXCLUDED - 1)
     coordinates = queries.T
@@ -65,10 +95,53 @@ def knn_distances(
                 )
         return tuple(smallest), None
 
-    none_yet = tuple(jnp.full(num_queries, jnp.inf, queries.dtype) for _ in range(k))
+    none_yet = tuple(jnp.full(queries.shape[0], jnp.inf, queries.dtype) for _ in range(k))
     blocks = (points.reshape(-1, block, points.shape[1]), labels.reshape(-1, block))
     smallest, _ = jax.lax.scan(pass_block, none_yet, blocks)
-    return jnp.sqrt(jnp.stack(smallest, axis=1))
+    return _distances(queries, smallest)
+
+
+def by_reduction(
+    k: int,
+    queries: jax.Array,
+    points: jax.Array,
+    exclude: jax.Array,
+    labels: jax.Array,
+    count: jax.Array,
+) -> jax.Array:
+    """As knn_distances. One reduction over the points that carries the k smallest, with the
+    distances fused into it: a few large kernels, and no loop over blocks that a GPU would wait for.
+    """
+    points = jnp.where(_neighbors(points, count)[:, None], points, jnp.inf)
+    # [B, M], never stored. Reduced along M: along B, XLA stores it (seen in what it compiles to).
+    differences = [queries[:, f, None] - points[None, :, f] for f in range(queries.shape[1])]
+    squared = sum(d * d for d in differences)
+    squared = jnp.where(exclude[:, None] == labels[None, :], jnp.inf, squared)
+    nothing = jnp.asarray(jnp.inf, squared.dtype)
+    alone = squared, *[jnp.full_like(squared, jnp.inf)] * (k - 1)  # each point: k with itself first
+    return _distances(queries, jax.lax.reduce(alone, (nothing,) * k, _merged, (1,)))
+
+
+def _merged(a, b):
+    """The k smallest of two ascending lists of k: the j-th is the least, over the ways to take j
+    from both, of the larger of the two last taken.
+    """
+    smallest = []
+    for j in range(len(a)):
+        last_taken = [jnp.maximum(a[i], b[j - 1 - i]) for i in range(j)] + [jnp.minimum(a[j], b[j])]
+        smallest.append(functools.reduce(jnp.minimum, last_taken))
+    return tuple(smallest)
+
+
+def _neighbors(points, count):
+    """[M] bool: filled, and finite."""
+    return (jnp.arange(points.shape[0]) < count) & jnp.all(jnp.isfinite(points), axis=1)
+
+
+def _distances(queries, smallest):
+    """[B, k] from k arrays [B] of squares."""
+    valid = jnp.all(jnp.isfinite(queries), axis=1, keepdims=True)
+    return jnp.where(valid, jnp.sqrt(jnp.stack(smallest, axis=1)), jnp.nan)
 
 
 def smallest_k(values: jax.Array, k: int) -> jax.Array:
