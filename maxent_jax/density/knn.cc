@@ -70,6 +70,8 @@ INLINE void insert(float square, float* smallest, int64_t k, int64_t stride) {
   smallest[place * stride] = square;
 }
 
+int64_t num_threads(ffi::ThreadPool& pool) { return std::max<int64_t>(1, pool.num_threads()); }
+
 // Calls job(0), …, job(count - 1), on XLA's threads and this one. A helper that starts late finds
 // nothing to do, so that nobody waits for a thread that is itself waiting.
 void parallel(ffi::ThreadPool& pool, int64_t count, const std::function<void(int64_t)>& job) {
@@ -83,8 +85,8 @@ void parallel(ffi::ThreadPool& pool, int64_t count, const std::function<void(int
       shared->done.fetch_add(1);
     }
   };
-  const int64_t helpers = std::min<int64_t>(pool.num_threads(), count) - 1;
-  for (int64_t i = 0; i < helpers; ++i) pool.Schedule(decltype(work)(work));
+  const int64_t helpers = std::min(num_threads(pool), count) - 1;
+  for (int64_t i = 0; i < helpers; ++i) pool.Schedule([work] { work(); });
   work();
   while (shared->done.load() < count) std::this_thread::yield();
 }
@@ -269,7 +271,7 @@ std::vector<int32_t> leaf_order(ffi::ThreadPool& pool, const Problem& problem) {
     if (finite(problem.points + m * problem.num_features, problem.num_features)) order.push_back(m);
   Splitter splitter(problem, order);
   std::vector<Splitter::Range> ranges{{0, static_cast<int64_t>(order.size() + kLeaf - 1) / kLeaf}};
-  while (ranges.size() < 4 * static_cast<size_t>(pool.num_threads())) {
+  while (static_cast<int64_t>(ranges.size()) < 4 * num_threads(pool)) {
     std::vector<Splitter::Range> halves(2 * ranges.size());
     parallel(pool, ranges.size(), [&](int64_t i) {
       const auto [from, to] = ranges[i];
@@ -484,7 +486,7 @@ ffi::Error knn(ffi::ThreadPool pool, ffi::Buffer<ffi::F32> queries, ffi::Buffer<
   }
   const int64_t num_queries = shape[shape.size() - 2];
   // Several jobs for each thread, so that none waits long for another.
-  const int64_t share = num_queries * num_searches / (4 * std::max<int64_t>(1, pool.num_threads()));
+  const int64_t share = num_queries * num_searches / (4 * num_threads(pool));
   const int64_t tile = std::clamp<int64_t>(share / kLanes * kLanes, kLanes, kTile);
   const int64_t tiles = (num_queries + tile - 1) / tile;
   std::vector<std::pair<const Problem*, int64_t>> passes;
