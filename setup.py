@@ -1,31 +1,51 @@
-"""Builds the C++ search for nearest neighbours, where there is a compiler; else XLA does it."""
+"""Builds the C++ of maxent_jax/native where there is a compiler; the package works without."""
 
+import copy
 import importlib.util
 import platform
 from pathlib import Path
 
 from setuptools import Extension, setup
+from setuptools.command.build_ext import build_ext
 
-# The file is compiled once for each; at run time the first that the processor can run is loaded.
+# The library is compiled once for each; at run time the first that the processor can run is loaded.
 X86_64 = {"v4": "-march=x86-64-v4", "v3": "-march=x86-64-v3"}
 ARM64 = {"v8": "-march=armv8-a"}
 MACHINES = {"x86_64": X86_64, "AMD64": X86_64, "aarch64": ARM64, "arm64": ARM64}
 FLAGS = ["-std=c++17", "-O3", "-ffp-contract=fast", "-Wno-psabi", "-Wno-ignored-attributes"]
+NATIVE = Path("maxent_jax", "native")
+
+
+def headers(package: str) -> str:
+    """The folder of the C headers that an installed package brings."""
+    spec = importlib.util.find_spec(package)
+    return str(Path(spec.origin).parent / "include")
 
 
 def extension(variant: str, architecture: str) -> Extension:
-    jaxlib = Path(importlib.util.find_spec("jaxlib").origin).parent
+    """The library for one kind of processor."""
     return Extension(
-        f"maxent_jax.density._knn_{variant}",
-        ["maxent_jax/density/knn.cc"],
-        include_dirs=[str(jaxlib / "include")],
+        f"maxent_jax.native._{variant}",
+        [str(NATIVE / name) for name in ("cpu.cc", "knn.cc", "physics.cc")],
+        depends=[str(NATIVE / "parallel.h")],
+        include_dirs=[str(NATIVE), headers("jaxlib"), headers("mujoco")],
         extra_compile_args=[*FLAGS, architecture],
         optional=True,  # a machine without a compiler gets the package all the same
     )
 
 
+class BuildVariants(build_ext):
+    """Side by side, each with object files of its own: the sources have the same names."""
+
+    def build_extension(self, ext: Extension) -> None:  # noqa: D102
+        own = copy.copy(self)
+        own.build_temp = str(Path(self.build_temp, ext.name))
+        super(BuildVariants, own).build_extension(ext)
+
+
 variants = MACHINES.get(platform.machine(), {})
 setup(
+    cmdclass={"build_ext": BuildVariants},
     options={"build_ext": {"parallel": True}},
     ext_modules=[extension(variant, flag) for variant, flag in variants.items()],
 )

@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import common
-from maxent_jax import analysis, runs
-from maxent_jax.density import native
+from maxent_jax import analysis, native, runs
 from maxent_jax.density.knn import by_blocks, knn_distances
 
 NUM_NEIGHBORS, NUM_FEATURES = 3, 7  # k and p of the paper
@@ -237,7 +236,7 @@ def measure(problem: Problem, peers, repeats: int) -> Iterator[dict[str, Any]]:
         )
 
     searches = {"maxent_jax": ours}
-    if native.available():
+    if native.library():
         searches["maxent_jax in XLA"] = in_xla
     if problem.num_pairs <= MATRIX_PAIRS:
         searches["jax.lax.top_k"] = top_k

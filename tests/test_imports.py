@@ -10,8 +10,8 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "maxent_jax"
 # The reading order of the package, first to last.
 ORDER = [
-    *("types", "config", "runs", "runtime"),
-    *("density.histogram", "density.native", "density.knn", "density.sharding"),
+    *("types", "config", "runs", "runtime", "native"),
+    *("density.histogram", "density.knn", "density.sharding"),
     *("density.entropy", "density.reservoir"),
     *("envs.physics", "envs.mjx_backend", "envs.mujoco_backend", "envs.torso", "envs.task"),
     *("envs.ant", "envs.walker2d", "envs.humanoid", "envs.pendulum", "envs.mountain_car"),

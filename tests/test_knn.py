@@ -11,12 +11,15 @@ import pytest
 from hypothesis import strategies
 from scipy.spatial import cKDTree
 
-from maxent_jax.density import native
+from maxent_jax import native
 from maxent_jax.density.knn import (
     FEW_QUERIES,
     LARGE_BLOCK,
+    TREE_POINTS,
+    TREE_QUERIES,
     by_blocks,
     by_reduction,
+    in_cpp,
     knn_distances,
     smallest_k,
 )
@@ -27,9 +30,9 @@ RELATIVE = 1e-6
 DIMS = 7
 jitted = jax.jit(knn_distances, static_argnums=2)
 FORMS = {"blocks": by_blocks, "reduction": by_reduction}
-if native.available():
-    FORMS["every point"] = functools.partial(native.knn_distances, tree=False)
-    FORMS["tree"] = functools.partial(native.knn_distances, tree=True)
+if native.library():
+    FORMS["every point"] = functools.partial(in_cpp, tree=False)
+    FORMS["tree"] = functools.partial(in_cpp, tree=True)
 JITTED = {name: jax.jit(form, static_argnums=0) for name, form in FORMS.items()}
 HAS_COMPILER = any(shutil.which(name) for name in ("c++", "g++", "clang++"))
 
@@ -261,14 +264,14 @@ def test_no_matrix_of_distances_is_stored(form):
 def test_a_large_problem_is_solved_exactly():
     """Large enough that the search chooses a tree for itself."""
     rng = np.random.default_rng(11)
-    points = walk(rng, native.TREE_POINTS)
-    queries = points[:: native.TREE_POINTS // native.TREE_QUERIES] + np.float32(0.5)
+    points = walk(rng, TREE_POINTS)
+    queries = points[:: TREE_POINTS // TREE_QUERIES] + np.float32(0.5)
     distance, _ = cKDTree(points.astype(np.float64)).query(queries.astype(np.float64), 3)
     assert_close(jitted(queries, points, 3), distance)
 
 
 def test_the_compiled_search_was_built_where_there_is_a_compiler():
-    assert native.available() or not HAS_COMPILER
+    assert native.library() or not HAS_COMPILER
 
 
 @pytest.mark.parametrize("form", FORMS)

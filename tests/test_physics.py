@@ -1,5 +1,7 @@
 """The physics step: the backends against each other, and what makes it a pure function."""
 
+import copy
+
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -9,7 +11,7 @@ import pytest
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver
 
-from maxent_jax import envs
+from maxent_jax import envs, native
 from maxent_jax.envs import mjx_backend, mujoco_backend, physics
 from maxent_jax.envs.physics import Options, PhysicsState
 
@@ -24,15 +26,25 @@ def model():
     return physics.load_model(envs.TASKS["ant"].xml)
 
 
-def make_step(model, num_substeps=FRAME_SKIP):
+PATHS = {"python": mujoco_backend.through_python}
+if native.library():
+    PATHS["xla"] = mujoco_backend.through_xla
+
+
+def make_step(path, model, num_substeps=FRAME_SKIP):
     """The C step without its derived fields, of which Ant has none."""
-    step = mujoco_backend.make(model, num_substeps, ()).step
+    step = PATHS[path](model, num_substeps, ())
     return lambda state, control: step(state, control)[0]
 
 
+@pytest.fixture(scope="module", params=PATHS)
+def path(request):
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def step(model):
-    return jax.jit(make_step(model))
+def step(path, model):
+    return jax.jit(make_step(path, model))
 
 
 def random_run(task, model):
@@ -180,11 +192,11 @@ LEADING = {"single": (), "one axis": (6,), "three axes": (2, 1, 3)}
 
 @pytest.mark.parametrize("leading", LEADING.values(), ids=LEADING)
 @pytest.mark.parametrize("compiled", [False, True], ids=["eager", "jit"])
-def test_any_leading_axes_give_the_rows_of_one(step, model, visited, leading, compiled):
+def test_any_leading_axes_give_the_rows_of_one(step, path, model, visited, leading, compiled):
     count = int(np.prod(leading))
     few = rows_of(visited, slice(-count, None))
     shaped = jax.tree.map(lambda x: x.reshape(*leading, x.shape[-1]), few)
-    function = step if compiled else make_step(model)
+    function = step if compiled else make_step(path, model)
     after = function(*shaped)
     assert after.qpos.shape == (*leading, 15)
     flat = jax.tree.map(lambda x: x.reshape(count, x.shape[-1]), after)
@@ -224,12 +236,12 @@ def test_a_diverged_row_shows_and_harms_no_other(step, visited, poison, monkeypa
     assert_same_bits(step(*few), expected)  # nor does it leave anything behind
 
 
-def test_a_row_with_derived_fields_depends_on_no_other(monkeypatch, tmp_path):
+def test_a_row_with_derived_fields_depends_on_no_other(path, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     task = envs.TASKS["humanoid"]
     model = physics.load_model(task.xml)
     states, controls = rows_of(random_run(task, model), slice(0, None, 20))
-    step = jax.jit(mujoco_backend.make(model, task.frame_skip, task.derived).step)
+    step = jax.jit(PATHS[path](model, task.frame_skip, task.derived))
     expected = step(states, controls)
     poisoned = step(states._replace(qvel=states.qvel.at[3, 5].set(np.nan)), controls)
     good = jnp.array([0, 1, 2, 4, 5, 6, 7, 8, 9])
@@ -237,6 +249,37 @@ def test_a_row_with_derived_fields_depends_on_no_other(monkeypatch, tmp_path):
     assert not np.isfinite(poisoned[0].qvel[3]).all()
     backwards = jnp.arange(10)[::-1]
     assert_same_bits(step(*rows_of((states, controls), backwards)), rows_of(expected, backwards))
+
+
+@pytest.mark.parametrize("name", envs.TASKS)
+def test_the_native_library_gives_the_bits_of_python(name):
+    task = envs.TASKS[name]
+    model = physics.load_model(task.xml)
+    states, controls = random_run(task, model)
+    looks = (task.frame_skip, 0) if task.derived else (task.frame_skip,)
+    found = {
+        path: [jax.jit(make(model, n, task.derived))(states, controls) for n in looks]
+        for path, make in PATHS.items()
+    }
+    first, *others = found.values()
+    for other in others:
+        assert_same_bits(first, other)
+
+
+def test_a_field_that_the_native_library_does_not_know_is_left_to_python(model, visited):
+    assert mujoco_backend.through_xla(model, FRAME_SKIP, ("subtree_com",)) is None
+    _, derived = mujoco_backend.make(model, FRAME_SKIP, ("subtree_com",)).step(*visited)
+    assert derived["subtree_com"].shape == (NUM_EPISODES * LENGTH, 3 * model.nbody)
+
+
+def test_changing_a_model_does_not_change_programs_that_have_it(model, visited):
+    mine = copy.copy(model)
+    step = jax.jit(mujoco_backend.make(mine, FRAME_SKIP, ()).step)
+    before = step(*visited)
+    mine.opt.gravity[:] = 0
+    assert_same_bits(step(*visited), before)
+    weightless = jax.jit(mujoco_backend.make(mine, FRAME_SKIP, ()).step)(*visited)
+    assert not np.array_equal(weightless[0].qvel, before[0].qvel)
 
 
 def test_scan_is_the_same_steps(step, visited):
@@ -249,11 +292,11 @@ def test_scan_is_the_same_steps(step, visited):
     assert_same_bits(scanned, stepped)
 
 
-def test_the_warm_start_travels_between_steps(visited):
+def test_the_warm_start_travels_between_steps(path, visited):
     # One solver iteration, so that the result leans on where the solver starts.
     model = physics.load_model(envs.TASKS["ant"].xml, Options(iterations=1))
-    at_once = make_step(model, 2 * FRAME_SKIP)(*visited)
-    step = make_step(model)
+    at_once = make_step(path, model, 2 * FRAME_SKIP)(*visited)
+    step = make_step(path, model)
     states, controls = visited
     middle = step(states, controls)
     dropped = middle._replace(warmstart=jnp.zeros_like(middle.warmstart))

@@ -1,8 +1,8 @@
 """Exact distances to the k nearest points, on the device, without a distance matrix in memory.
 
 Distances are direct float32 differences: the expanded square loses the small ones, which matter
-most. One question, three answers that differ in speed alone: compiled C++ on a CPU (native), and
-two forms in XLA, by blocks of points for CPUs and by one reduction for GPUs.
+most. One question, three answers that differ in speed alone: compiled C++ on a CPU, and two forms
+in XLA, by blocks of points for CPUs and by one reduction for GPUs.
 """
 
 import functools
@@ -11,12 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from maxent_jax.density import native
+from maxent_jax import native
 
 NONE_EXCLUDED = -1
 # Points handled at once, unrolled. Measured on two cores with AVX-512 inside a scan: few queries
 # run fastest with 8 (0.9 against 0.3 Gpair/s with 16), many with 32 (1.6).
 FEW_QUERIES, SMALL_BLOCK, LARGE_BLOCK = 2048, 8, 32
+# Where putting the points into a tree repays itself. Measured on two cores with Gaussian points,
+# the hardest: with 7 features 0.9 times as fast at this size and 3 times with 8,192 queries of
+# 131,072 points; with 10 features 2.2 times there, with 16 no longer (0.4). With a run's states
+# twice to seven times as fast from this size on.
+TREE_QUERIES, TREE_POINTS, TREE_FEATURES = 2048, 8192, 10
 
 
 def knn_distances(
@@ -52,7 +57,7 @@ def knn_distances(
     labels = jnp.arange(num_points, dtype=jnp.int32) if labels is None else labels
     count = jnp.asarray(num_points if count is None else count, jnp.int32)
     single = queries.dtype == points.dtype == jnp.float32
-    on_cpu = native.knn_distances if single and native.available() else by_blocks
+    on_cpu = in_cpp if single and native.library() else by_blocks
     return jax.lax.platform_dependent(
         *(jnp.asarray(queries), jnp.asarray(points), exclude, labels, count),
         cpu=functools.partial(on_cpu, k),
@@ -60,6 +65,33 @@ def knn_distances(
         rocm=functools.partial(by_reduction, k),
         default=functools.partial(by_blocks, k),
     )
+
+
+def in_cpp(
+    k: int,
+    queries: jax.Array,
+    points: jax.Array,
+    exclude: jax.Array,
+    labels: jax.Array,
+    count: jax.Array,
+    tree: bool | None = None,
+) -> jax.Array:
+    """As knn_distances, in float32, on a CPU with the native library. Its distances are those of
+    by_blocks, to the bit where the processor fuses multiplication and addition.
+
+    Args:
+      tree: whether the points are put into a tree first; where it pays, if left out.
+    """
+    if tree is None:
+        (num_queries, num_features), num_points = queries.shape, points.shape[0]
+        many = num_queries >= TREE_QUERIES and num_points >= TREE_POINTS
+        tree = many and num_features <= TREE_FEATURES
+    call = jax.ffi.ffi_call(
+        "maxent_knn",
+        jax.ShapeDtypeStruct((queries.shape[0], k), jnp.float32),
+        vmap_method="expand_dims",  # what is not mapped over is not copied
+    )
+    return call(queries, points, labels, exclude, count, tree=tree)
 
 
 def by_blocks(

@@ -1,9 +1,15 @@
-"""Physics on the host: C MuJoCo on all cores, behind a callback."""
+"""C MuJoCo on all cores: called by XLA through the native library or, where there is none or the
+program runs elsewhere than on a CPU, behind a callback. Both give the same numbers.
+"""
 
+import copy
+import ctypes
+import hashlib
 import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +17,16 @@ import mujoco
 import numpy as np
 from mujoco import batch
 
+from maxent_jax import native
 from maxent_jax.envs.physics import Derived, Physics, PhysicsState
 
 CORES = os.cpu_count() or 1
 STATE = ("qpos", "qvel", "qacc_warmstart")  # a PhysicsState, as MjData names it
+# Of C MuJoCo, in the order that maxent_add_model expects.
+FUNCTIONS = ("mj_makeData", "mj_step", "mj_forward", "mj_rnePostConstraint")
 Rows = list[np.ndarray]  # [B, ...] each
+Simulate = Callable[[PhysicsState, jax.Array], tuple[PhysicsState, Derived]]
+_added: dict[str, mujoco.MjModel] = {}  # what the native library holds on to
 
 
 def make(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Physics:
@@ -25,36 +36,108 @@ def make(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> 
       num_substeps: physics steps in a control step.
       derived: fields of MjData to give beside the state.
     """
-    scratch = mujoco.MjData(model)
-    outputs = [*STATE, *derived]
-    sizes = [getattr(scratch, name).size for name in outputs]
-    simulate = _Threads(model, num_substeps, derived) if derived else _Batches(model, num_substeps)
+    model = copy.copy(model)  # the caller may change the original
+    step = _simulate(model, num_substeps, derived)
+    if not derived:
+        return Physics(step, lambda state: {})
+    look = _simulate(model, 0, derived)
 
-    def call(simulator: Callable[[Rows], Rows], state: PhysicsState, control: jax.Array):
-        leading = control.shape[:-1]
-        shapes = [jax.ShapeDtypeStruct((*leading, n), control.dtype) for n in sizes]
+    def derive(state: PhysicsState) -> Derived:
+        return look(state, jnp.zeros((*state.qpos.shape[:-1], model.nu)))[1]
 
-        def rows(*arrays):
-            flat = [np.asarray(x).reshape(-1, x.shape[-1]) for x in arrays]
-            lead = arrays[0].shape[:-1]
-            # A diverging simulation becomes inf, and is guarded against.
-            with np.errstate(over="ignore"):
-                return [x.reshape(*lead, -1).astype(np.float32) for x in simulator(flat)]
+    return Physics(step, derive)
 
+
+def _simulate(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Simulate:
+    """A control step, or with 0 substeps a look at the state, in the best way there is."""
+    by_python = through_python(model, num_substeps, derived)
+    by_xla = through_xla(model, num_substeps, derived)
+    if by_xla is None:
+        return by_python
+
+    def simulate(state: PhysicsState, control: jax.Array) -> tuple[PhysicsState, Derived]:
+        return jax.lax.platform_dependent(state, control, cpu=by_xla, default=by_python)
+
+    return simulate
+
+
+def through_xla(
+    model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]
+) -> Simulate | None:
+    """The native library's function, for a CPU; None if there is none, or not for this model."""
+    name = _add(model, derived)
+    if name is None:
+        return None
+    sizes = _sizes(model, derived)
+
+    def simulate(state: PhysicsState, control: jax.Array) -> tuple[PhysicsState, Derived]:
+        widths = [*(x.shape[-1] for x in state), sum(sizes.values())]
+        shapes = [jax.ShapeDtypeStruct((*control.shape[:-1], n), jnp.float32) for n in widths]
+        call = jax.ffi.ffi_call("maxent_physics", shapes, vmap_method="broadcast_all")
+        *after, fields = call(*state, control, model=name, num_substeps=np.int64(num_substeps))
+        ends = np.cumsum(list(sizes.values()), dtype=int)[:-1]
+        parts = jnp.split(fields, ends, axis=-1) if sizes else []
+        return PhysicsState(*after), dict(zip(sizes, parts, strict=True))
+
+    return simulate
+
+
+def through_python(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Simulate:
+    """Python's bindings behind a callback, from any device."""
+    sizes = _sizes(model, derived)
+    simulator: Callable[[Rows], Rows] = (
+        _Threads(model, num_substeps, derived) if derived else _Batches(model, num_substeps)
+    )
+
+    def rows(*arrays):
+        flat = [np.asarray(x).reshape(-1, x.shape[-1]) for x in arrays]
+        lead = arrays[0].shape[:-1]
+        # A diverging simulation becomes inf, and is guarded against.
+        with np.errstate(over="ignore"):
+            return [x.reshape(*lead, -1).astype(np.float32) for x in simulator(flat)]
+
+    def simulate(state: PhysicsState, control: jax.Array) -> tuple[PhysicsState, Derived]:
+        widths = [*(x.shape[-1] for x in state), *sizes.values()]
+        shapes = [jax.ShapeDtypeStruct((*control.shape[:-1], n), jnp.float32) for n in widths]
         found = jax.pure_callback(rows, shapes, *state, control, vmap_method="broadcast_all")
         return PhysicsState(*found[:3]), dict(zip(derived, found[3:], strict=True))
 
-    def step(state: PhysicsState, control: jax.Array) -> tuple[PhysicsState, Derived]:
-        return call(simulate, state, control)
+    return simulate
 
-    if not derived:
-        return Physics(step, lambda state: {})
-    look = _Threads(model, 0, derived)
 
-    def derive(state: PhysicsState) -> Derived:
-        return call(look, state, jnp.zeros((*state.qpos.shape[:-1], model.nu)))[1]
+def _sizes(model: mujoco.MjModel, derived: tuple[str, ...]) -> dict[str, int]:
+    scratch = mujoco.MjData(model)
+    return {name: getattr(scratch, name).size for name in derived}
 
-    return Physics(step, derive)
+
+def _add(model: mujoco.MjModel, derived: tuple[str, ...]) -> str | None:
+    """Makes a model known to the native library; None if it can't step this one.
+
+    Its name is that of its content, so that a program which another process compiled finds it.
+    """
+    library = native.library()
+    if library is None or library.maxent_mujoco_version() != mujoco.mj_version():
+        return None
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    name = hashlib.sha256(content.tobytes() + " ".join(derived).encode()).hexdigest()
+    if name in _added:
+        return name
+    loaded = ctypes.CDLL(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
+    functions = [ctypes.cast(getattr(loaded, f), ctypes.c_void_p) for f in FUNCTIONS]
+    sizes = _sizes(model, derived).values()
+    known = library.maxent_add_model(
+        name.encode(),
+        ctypes.c_void_p(model._address),
+        (ctypes.c_void_p * len(functions))(*functions),
+        (ctypes.c_char_p * len(derived))(*(field.encode() for field in derived)),
+        (ctypes.c_int64 * len(derived))(*sizes),
+        ctypes.c_int64(len(derived)),
+    )
+    if not known:
+        return None
+    _added[name] = model
+    return name
 
 
 class _Batches:

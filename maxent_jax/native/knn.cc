@@ -7,22 +7,22 @@
 // monotonic, so that a box is never farther than a point within it: the two agree to the bit.
 
 #include <algorithm>
-#include <atomic>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
 #include <functional>
 #include <limits>
-#include <memory>
 #include <numeric>
-#include <thread>
 #include <vector>
 
+#include "parallel.h"
 #include "xla/ffi/api/ffi.h"
 
 namespace {
 
 namespace ffi = xla::ffi;
+using maxent::num_threads;
+using maxent::parallel;
 
 #define INLINE inline __attribute__((always_inline))
 
@@ -68,27 +68,6 @@ INLINE void insert(float square, float* smallest, int64_t k, int64_t stride) {
   for (; place > 0 && smallest[(place - 1) * stride] > square; --place)
     smallest[place * stride] = smallest[(place - 1) * stride];
   smallest[place * stride] = square;
-}
-
-int64_t num_threads(ffi::ThreadPool& pool) { return std::max<int64_t>(1, pool.num_threads()); }
-
-// Calls job(0), …, job(count - 1), on XLA's threads and this one. A helper that starts late finds
-// nothing to do, so that nobody waits for a thread that is itself waiting.
-void parallel(ffi::ThreadPool& pool, int64_t count, const std::function<void(int64_t)>& job) {
-  struct Shared {
-    std::atomic<int64_t> next{0}, done{0};
-  };
-  auto shared = std::make_shared<Shared>();
-  auto work = [shared, count, &job] {
-    for (int64_t i; (i = shared->next.fetch_add(1)) < count;) {
-      job(i);
-      shared->done.fetch_add(1);
-    }
-  };
-  const int64_t helpers = std::min(num_threads(pool), count) - 1;
-  for (int64_t i = 0; i < helpers; ++i) pool.Schedule([work] { work(); });
-  work();
-  while (shared->done.load() < count) std::this_thread::yield();
 }
 
 struct Problem {
@@ -504,20 +483,6 @@ ffi::Error knn(ffi::ThreadPool pool, ffi::Buffer<ffi::F32> queries, ffi::Buffer<
 }
 
 }  // namespace
-
-// Whether this processor has the instructions that this file was compiled to.
-extern "C" int maxent_knn_runs_here() {
-#if defined(__x86_64__) && defined(__AVX512F__)
-  return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") &&
-         __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq") &&
-         __builtin_cpu_supports("avx512cd");
-#elif defined(__x86_64__)
-  return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
-         __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2");
-#else
-  return 1;
-#endif
-}
 
 XLA_FFI_DEFINE_HANDLER_SYMBOL(maxent_knn, knn,
                               ffi::Ffi::Bind()
