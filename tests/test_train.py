@@ -221,7 +221,9 @@ def test_an_environment_of_the_users_trains(tmp_path):
     )
     make = lambda backend, physics: envs.from_xml(tmp_path / "cart.xml", 5, backend, physics)
     envs.register("cart", make)
-    run_smoke(tmp_path / "run", "user:cart", "mujoco")
+    directory = tmp_path / "run"
+    directory.mkdir()
+    run_smoke(directory, "user:cart", "mujoco")
 
 
 @pytest.mark.parametrize(
