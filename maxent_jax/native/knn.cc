@@ -15,6 +15,10 @@
 #include <numeric>
 #include <vector>
 
+#ifdef __AVX512F__
+#include <immintrin.h>
+#endif
+
 #include "parallel.h"
 #include "xla/ffi/api/ffi.h"
 
@@ -54,13 +58,20 @@ INLINE Lanes smaller(Lanes a, Lanes b) { return a < b ? a : b; }
 
 INLINE Lanes larger(Lanes a, Lanes b) { return a < b ? b : a; }
 
-INLINE bool any(Mask mask) {
-  using Words = int64_t __attribute__((vector_size(sizeof(Mask))));
-  const Words words = (Words)mask;
+// Whether any lane of `a` is below its like of `b`: the one test of the inner loops.
+INLINE bool any_below(Lanes a, Lanes b) {
+#ifdef __AVX512F__
+  return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LT_OQ) != 0;
+#else
+  using Words = int64_t __attribute__((vector_size(sizeof(Lanes))));
+  const Words words = (Words)(a < b);
   int64_t bits = 0;
   for (int i = 0; i < kLanes / 2; ++i) bits |= words[i];
   return bits != 0;
+#endif
 }
+
+INLINE Lanes all(float x) { return Lanes{} + x; }
 
 // The `k` smallest squares, ascending, `stride` apart.
 INLINE void insert(float square, float* smallest, int64_t k, int64_t stride) {
@@ -117,10 +128,10 @@ INLINE int64_t pass(const Problem& problem, int64_t from, int64_t to, const floa
     }
     Lanes nearest = squares[0];
     for (int u = 1; u < kUnroll; ++u) nearest = smaller(squares[u], nearest);
-    if (__builtin_expect(!any(nearest < worst), 1)) continue;
+    if (__builtin_expect(!any_below(nearest, worst), 1)) continue;
     for (int u = 0; u < kUnroll; ++u) {
-      if (!any(squares[u] < worst)) continue;
-      Lanes square = excluded == problem.labels[m + u] ? Lanes{} + kInf : squares[u];
+      if (!any_below(squares[u], worst)) continue;
+      Lanes square = excluded == problem.labels[m + u] ? all(kInf) : squares[u];
       for (int64_t i = 0; i < k; ++i) {  // what is larger moves on to the next place
         const Lanes kept = load(smallest + i * kLanes);
         store(smaller(square, kept), smallest + i * kLanes);
@@ -344,9 +355,9 @@ INLINE void search_leaf(const Tree& tree, int64_t leaf, const float* query, int3
     }
   Lanes nearest = squares[0];
   for (int group = 1; group < kGroups; ++group) nearest = smaller(squares[group], nearest);
-  if (!any(nearest < smallest[k - 1])) return;
+  if (!any_below(nearest, all(smallest[k - 1]))) return;
   for (int group = 0; group < kGroups; ++group) {
-    if (!any(squares[group] < smallest[k - 1])) continue;
+    if (!any_below(squares[group], all(smallest[k - 1]))) continue;
     for (int lane = 0; lane < kLanes; ++lane)
       if (squares[group][lane] < smallest[k - 1] &&
           exclude != tree.labels[leaf * kLeaf + group * kLanes + lane])
@@ -370,7 +381,7 @@ INLINE int64_t open_group(const Tree& tree, int32_t level, int64_t group, const 
     outside = outside > 0 ? outside : Lanes{};
     bounds += outside * outside;
   }
-  if (!any(bounds < worst)) return 0;
+  if (!any_below(bounds, all(worst))) return 0;
   int64_t num = 0;
   for (int lane = 0; lane < kLanes; ++lane) {
     if (!(bounds[lane] < worst)) continue;
