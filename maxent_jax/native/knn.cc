@@ -1,8 +1,8 @@
 // Exact k-nearest-neighbour distances on a CPU, called from XLA. See knn.py for what they mean.
 //
 // Few queries meet every point: 16 queries lie in the SIMD lanes while the points pass by, and a
-// point that is nearer than the worst of the k kept so far, which is rare, is inserted lane by
-// lane. Many queries descend a tree of bounding boxes: points in leaves of 64, 16 nodes below one.
+// point that is nearer to one of them than the worst of its k so far, which is rare, is inserted.
+// Many queries descend a tree of bounding boxes: points in leaves of 64, 16 nodes below one.
 // Both compute a squared distance by the same operations in the same order, and rounding is
 // monotonic, so that a box is never farther than a point within it: the two agree to the bit.
 
@@ -30,11 +30,11 @@ using maxent::parallel;
 
 #define INLINE inline __attribute__((always_inline))
 
-constexpr int kLanes = 16;     // float32 in an AVX-512 register; narrower machines use several
-constexpr int kLeaf = 64;      // points; four registers share one test
-constexpr int kFanout = kLanes;
-constexpr int kTile = 64;      // queries that one job takes, at most
-constexpr int kChunk = 512;    // points that stay in the first-level cache while a tile passes
+constexpr int kLanes = 16;       // float32 in an AVX-512 register; narrower machines use several
+constexpr int kLeaf = 64;        // points; four registers share one test
+constexpr int kFanout = kLanes;  // children of a node
+constexpr int kTile = 64;        // queries that one job takes, at most
+constexpr int kChunk = 512;      // points that stay in the first-level cache while a tile passes
 constexpr float kInf = std::numeric_limits<float>::infinity();
 
 using Lanes = float __attribute__((vector_size(kLanes * sizeof(float))));
@@ -73,17 +73,16 @@ INLINE bool any_below(Lanes a, Lanes b) {
 
 INLINE Lanes all(float x) { return Lanes{} + x; }
 
-// The `k` smallest squares, ascending, `stride` apart.
-INLINE void insert(float square, float* smallest, int64_t k, int64_t stride) {
+// Into the `k` smallest squares, ascending.
+INLINE void insert(float square, float* smallest, int64_t k) {
   int64_t place = k - 1;
-  for (; place > 0 && smallest[(place - 1) * stride] > square; --place)
-    smallest[place * stride] = smallest[(place - 1) * stride];
-  smallest[place * stride] = square;
+  for (; place > 0 && smallest[place - 1] > square; --place) smallest[place] = smallest[place - 1];
+  smallest[place] = square;
 }
 
 struct Problem {
-  const float* queries;  // [B, F]
-  const float* points;   // [M, F]
+  const float* queries;    // [B, F]
+  const float* points;     // [M, F]
   const int32_t* labels;   // [M]
   const int32_t* exclude;  // [B]
   int64_t num_queries, num_points, num_features, k;
@@ -101,8 +100,6 @@ void finish(const Problem& problem, int64_t query, const float* smallest, int64_
   for (int64_t i = 0; i < problem.k; ++i)
     out[i] = valid ? std::sqrt(smallest[i * stride]) : std::numeric_limits<float>::quiet_NaN();
 }
-
-// --- Every point ---------------------------------------------------------------------------------
 
 // Points [from, to) against one register of queries. kFeatures 0: known only at run time.
 template <int kFeatures, int kUnroll>
@@ -150,8 +147,8 @@ INLINE void pass_all(const Problem& problem, int64_t from, int64_t to, const flo
   pass<kFeatures, 1>(problem, from, to, coordinates, exclude, smallest);
 }
 
-void pass_chunk(const Problem& problem, int64_t from, int64_t to,
-                             const float* coordinates, const int32_t* exclude, float* smallest) {
+void pass_chunk(const Problem& problem, int64_t from, int64_t to, const float* coordinates,
+                const int32_t* exclude, float* smallest) {
   switch (problem.num_features) {
 #define CASE(F) \
   case F:       \
@@ -186,8 +183,6 @@ void search_all(const Problem& problem, int64_t first, int64_t tile) {
   for (int64_t i = 0; i < num; ++i)
     finish(problem, first + i, &smallest[i / kLanes * k * kLanes + i % kLanes], kLanes);
 }
-
-// --- A tree of bounding boxes --------------------------------------------------------------------
 
 // Level 0 holds the leaves; 16 neighbours on a level have one parent on the next. All is laid out
 // with 16 points or nodes in the lanes: [groups, F, 16].
@@ -361,7 +356,7 @@ INLINE void search_leaf(const Tree& tree, int64_t leaf, const float* query, int3
     for (int lane = 0; lane < kLanes; ++lane)
       if (squares[group][lane] < smallest[k - 1] &&
           exclude != tree.labels[leaf * kLeaf + group * kLanes + lane])
-        insert(squares[group][lane], smallest, k, 1);
+        insert(squares[group][lane], smallest, k);
   }
 }
 
@@ -409,14 +404,14 @@ INLINE void descend(const Tree& tree, const float* query, int32_t exclude, float
   }
 }
 
-void descend_tile(const Problem& problem, const Tree& tree, int64_t first,
-                               int64_t last, float* smallest, Visit* visits) {
+void descend_tile(const Problem& problem, const Tree& tree, int64_t first, int64_t last,
+                  float* smallest, Visit* visits) {
   for (int64_t i = first; i < last; ++i) {
     const float* query = problem.queries + i * problem.num_features;
     std::fill(smallest, smallest + problem.k, kInf);
     switch (problem.num_features) {
-#define CASE(F)                                                                 \
-  case F:                                                                       \
+#define CASE(F)                                                               \
+  case F:                                                                     \
     descend<F>(tree, query, problem.exclude[i], smallest, problem.k, visits); \
     break;
       CASE(2) CASE(3) CASE(7)
@@ -434,8 +429,6 @@ void search_tree(const Problem& problem, const Tree& tree, int64_t first, int64_
   const int64_t last = std::min(first + tile, problem.num_queries);
   descend_tile(problem, tree, first, last, smallest.data(), visits.data());
 }
-
-// --- What XLA calls ------------------------------------------------------------------------------
 
 // Operands may have leading axes; an axis of 1 serves all along it.
 int64_t offset(ffi::AnyBuffer::Dimensions shape, size_t kept, ffi::AnyBuffer::Dimensions leading,
