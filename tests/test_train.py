@@ -294,7 +294,9 @@ def test_evaluate_says_when_there_is_no_checkpoint(tmp_path):
     assert "no complete checkpoint" in call("experiments.evaluate", tmp_path, expect=2).stderr
 
 
-@pytest.mark.parametrize("module", ["knn", "envs", "physics", "sac", "forward_velocity"])
+@pytest.mark.parametrize(
+    "module", ["knn", "envs", "physics", "sac", "forward_velocity", "compile_time"]
+)
 def test_a_benchmark_ends_with_json_rows(module):
     printed = call(f"benchmarks.{module}", "--toy").stdout.splitlines()
     assert printed[0].startswith("# python")

@@ -1,0 +1,71 @@
+"""How long until a run's first training step, with an empty compilation cache and a filled one?
+
+Runs `experiments.train` in processes of their own, for one step of all envs a segment. Seconds
+count from the start of its main to the end of the first segment: imports, compilation, the first
+rollouts of the mixture, one step with its gradient steps.
+"""
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from benchmarks import common
+from maxent_jax import runs
+from maxent_jax.config import ENVS, preset
+
+TRAIN = ("-m", "experiments.train", "--num-iterations", "1")
+
+
+def first_step(env: str, name: str, directory: Path, cache: Path) -> float:
+    """Seconds until the first step of a run, which ends soon after it."""
+    config = preset(name, env=env)
+    steps = config.num_envs * config.num_segments
+    flags = ("--env", env, "--preset", name, "--steps-per-iteration", str(steps))
+    subprocess.run(
+        [sys.executable, *TRAIN, *flags, "--out", str(directory)],
+        env=os.environ | {"XDG_CACHE_HOME": str(cache)},
+        capture_output=True,
+        check=True,
+    )
+    (row,) = runs.read_metrics(directory)
+    return row["wall_first_step"]
+
+
+def measure(env: str, name: str, repeats: int) -> Iterator[dict[str, Any]]:
+    """A row with an empty cache, and one with what that left behind."""
+    with tempfile.TemporaryDirectory() as folder:
+        caches = [Path(folder, f"cache-{i}") for i in range(repeats)]
+        for kind in ("cold", "warm"):
+            seconds = [
+                first_step(env, name, Path(folder, f"{kind}-{i}"), cache)
+                for i, cache in enumerate(caches)
+            ]
+            yield common.progress(
+                {
+                    "benchmark": "compile_time",
+                    "env": env,
+                    "preset": name,
+                    "cache": kind,
+                    "seconds_to_first_step": statistics.median(seconds),
+                    "runs": repeats,
+                }
+            )
+
+
+def main() -> None:
+    flags = common.parser(__doc__)
+    flags.add_argument("--env", choices=ENVS, default="ant")
+    args = flags.parse_args()
+    common.print_versions()
+    toy = ("pendulum", "smoke", 1)
+    for row in list(measure(*(toy if args.toy else (args.env, "quick", args.repeats)))):
+        common.emit(row)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""How many env steps a second does training make with several seeds side by side?
+
+A segment of a preset on Ant, gradient steps and reward included, for all seeds as one program.
+One seed stands for as many runs, one after another.
+"""
+
+import statistics
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+
+from benchmarks import common
+from maxent_jax import algorithm, runtime
+from maxent_jax.config import BACKENDS, ENVS, PRESETS, preset
+
+
+def seconds_per_segment(config, repeats: int) -> float:
+    """Median, after one segment to warm up; the state is donated, so that each goes on."""
+    programs = algorithm.programs(config)
+    state, _ = programs.begin(algorithm.start(config))
+    seconds = []
+    for _ in range(1 + repeats):
+        started = time.perf_counter()
+        state, metrics = programs.train_segment(state)
+        jax.block_until_ready((state, metrics))
+        seconds.append(time.perf_counter() - started)
+    return statistics.median(seconds[1:])
+
+
+def measure(name: str, settings: dict[str, Any], counts, repeats: int) -> Iterator[dict[str, Any]]:
+    """A row for each number of seeds; the first is what the others are held against."""
+    first = 0.0
+    for count in counts:
+        config = preset(name, num_seeds=count, **settings)
+        steps = count * config.num_envs * config.vector_steps
+        rate = steps / seconds_per_segment(config, repeats)
+        first = first or rate
+        yield common.progress(
+            {
+                "benchmark": "seeds",
+                "env": config.env,
+                "preset": name,
+                "seeds": count,
+                "env_steps_per_second": rate,
+                "over_one_by_one": rate / first,
+            }
+        )
+
+
+def main() -> None:
+    flags = common.parser(__doc__)
+    flags.add_argument("--env", choices=ENVS, default="ant")
+    flags.add_argument("--backend", choices=BACKENDS, default="auto")
+    flags.add_argument("--preset", choices=list(PRESETS), default="quick")
+    flags.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 4, 8])
+    args = flags.parse_args()
+    runtime.prepare(simulates_in_jax=args.backend == "mjx")
+    common.print_versions()
+    if args.toy:
+        rows = measure("smoke", {"env": "pendulum"}, (1, 2), args.repeats)
+    else:
+        settings = {"env": args.env, "backend": args.backend}
+        rows = measure(args.preset, settings, args.seeds, args.repeats)
+    for row in list(rows):
+        common.emit(row)
+
+
+if __name__ == "__main__":
+    main()
