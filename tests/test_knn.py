@@ -1,6 +1,7 @@
 """Exact neighbours against brute force in float64, from the same float32 inputs."""
 
 import functools
+import itertools
 import shutil
 
 import hypothesis
@@ -246,9 +247,9 @@ def test_what_the_tree_finds_is_what_every_point_gives_to_the_bit():
     labels = np.arange(50_000, dtype=np.int32)
     arguments = queries, points, exclude, labels, np.int32(49_990)
     names = [name for name in JITTED if name in ("every point", "tree")]
-    first, *others = (np.asarray(JITTED[name](3, *arguments)) for name in names)
-    for other in others:
-        np.testing.assert_array_equal(first, other)
+    found = [np.asarray(JITTED[name](3, *arguments)) for name in names]
+    for one, other in itertools.pairwise(found):
+        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("form", FORMS)
