@@ -295,7 +295,7 @@ def test_evaluate_says_when_there_is_no_checkpoint(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "module", ["knn", "envs", "physics", "sac", "forward_velocity", "compile_time"]
+    "module", ["knn", "envs", "physics", "sac", "seeds", "forward_velocity", "compile_time"]
 )
 def test_a_benchmark_ends_with_json_rows(module):
     printed = call(f"benchmarks.{module}", "--toy").stdout.splitlines()
