@@ -21,7 +21,7 @@ from mujoco import rollout
 
 from benchmarks import common
 from maxent_jax import envs, runtime
-from maxent_jax.config import PHYSICS
+from maxent_jax.config import PHYSICS, Config
 from maxent_jax.envs import base, physics
 from maxent_jax.envs.task import MujocoEnv
 
@@ -30,7 +30,6 @@ SETTLE_STEPS = {"ant": 40, "walker2d": 5, "humanoid": 5}
 MIN_STEPS = DRIFT_STEPS = 50  # of each env
 MUJOCO_STEPS = 6400  # of all envs together, at least; C MuJoCo is too fast for fewer
 SEED = 0
-EPISODE_LENGTH, NUM_STARTS = 1000, 4096  # as in training
 GYMNASIUM = {"ant": "Ant-v4", "walker2d": "Walker2d-v4", "humanoid": "Humanoid-v4"}
 
 
@@ -99,14 +98,14 @@ def with_episodes(workload: Workload, repeats: int) -> Measurement:
 
     def run(episodes, actions, keys):
         def step(episodes, inputs):
-            return base.step(workload.env, episodes, inputs[0], EPISODE_LENGTH, inputs[1])
+            return base.step(workload.env, episodes, inputs[0], Config.episode_length, inputs[1])
 
         _, transitions = jax.lax.scan(step, episodes, (actions, keys))
         return transitions.next_observation
 
     key = jax.random.key(SEED)
     init = jax.jit(base.init, static_argnums=(0, 1, 2))
-    episodes = init(workload.env, actions.shape[1], NUM_STARTS, key)
+    episodes = init(workload.env, actions.shape[1], Config.num_starts, key)
     program, _ = common.compiled(run, episodes, actions, keys)
     seconds = common.median_seconds(lambda: program(episodes, actions, keys), repeats)
     return Measurement(workload.num_steps / seconds, None, {})

@@ -125,10 +125,8 @@ def vmapped(search: Search, problem: Problem, repeats: int) -> Measurement:
     """As seeds side by side use it: each with its own queries and points. Held against as many
     single searches.
     """
-    take = lambda rows: (
-        jnp.stack([jnp.asarray(rows)] * NUM_SEEDS) + jnp.arange(NUM_SEEDS)[:, None, None]
-    )
-    queries, points = take(problem.queries[0]), take(problem.points)
+    shift = jnp.arange(NUM_SEEDS, dtype=jnp.float32)[:, None, None]
+    queries, points = (jnp.asarray(x) + shift for x in (problem.queries[0], problem.points))
     together, _ = common.compiled(jax.vmap(search), queries, points)
     single, _ = common.compiled(search, queries[0], points[0])
     pairs = [(queries[i], points[i]) for i in range(NUM_SEEDS)]
@@ -252,8 +250,11 @@ def main() -> None:
     flags = common.parser(__doc__)
     flags.add_argument("--run", type=Path, help="a run's directory, for states as they occur")
     args = flags.parse_args()
-    if args.run is not None:
-        runs.read_config(args.run)
+    try:
+        if args.run is not None:
+            runs.read_config(args.run)
+    except runs.RunError as mistake:
+        flags.error(str(mistake))
     common.print_versions(PEERS)
     peers = common.importable(PEERS)
     sizes = [(8, 512)] if args.toy else SIZES
