@@ -15,15 +15,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from maxent_jax import methods, mixture, occupancy, parts, training
+from maxent_jax import experience, methods, mixture, occupancy, parts, training
 from maxent_jax.config import Config
 from maxent_jax.density import histogram, reservoir
 from maxent_jax.envs import base
+from maxent_jax.experience import Reference
 from maxent_jax.mixture import Archive
 from maxent_jax.parts import Parts
 from maxent_jax.sac import agent
 from maxent_jax.sac.agent import Agent
-from maxent_jax.training import Learner, Reference
+from maxent_jax.training import Learner
 from maxent_jax.types import Metrics
 
 EVALUATION_SEED = 0  # rollouts that measure the mixture use the same randomness every time
@@ -91,7 +92,7 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
     best = occupancy.best(scores, visited)
     learner = learner._replace(
         agent=_start(p, method, archive, learner.agent, best, key_scratch),
-        replay=learner.replay._replace(items=training.measure(p, reference, learner.replay.items)),
+        replay=experience.measure_all(p, reference, learner.replay, learner.episodes.starts.obs),
         reference=reference,
         history=history,
     )

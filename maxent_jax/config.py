@@ -20,6 +20,7 @@ PHYSICS = ("reference", "fast")
 REWARDS = ("log1p", "linear", "log", "paper")
 INPUTS = ("state", "heading")
 SPACES = ("features", "position")
+REPLAY_DTYPES = ("float32", "float16")
 WEIGHTS = ("method", "uniform", "geometric")
 REFERENCES = ("method", "mixture", "history")
 STARTS = ("method", "scratch", "last", "best")
@@ -72,7 +73,7 @@ class Config:
     policy_inputs: str = "state"
     """What the networks see: state, or heading (the same in the agent's own horizontal frame)."""
     yaw_copies: int = 0
-    """Copies of each transition, turned by a random yaw, that enter the replay beside it."""
+    """Copies of each episode, turned by a random yaw, that the learner draws like the others."""
 
     reward: str = "log1p"
     """log1p: log(1 + R/c); linear: R/c; log: log(R/c); paper: p log R."""
@@ -126,9 +127,14 @@ class Config:
     batch_size: int = 128
     """Transitions in a gradient step."""
     replay_size: int = 1_000_000
-    """Transitions kept."""
+    """Env steps kept."""
+    replay_dtype: str = "float32"
+    """Of the states kept: float32, or float16 at half the memory (features and distances keep 32
+    bits)."""
     discount: float = 0.99
     """γ."""
+    return_steps: int = 1
+    """n: rewards summed before the critics' estimate of what follows."""
     soft_update_rate: float = 0.005
     """Of the target critics."""
     initial_temperature: float = 0.2
@@ -201,7 +207,7 @@ _PAPER: dict[str, tuple[Any, str]] = {
     "torque_limit": (1.0, "torques are limited to a share of the control range"),
     "end_flipped": (False, "an episode also ends upside down"),
     "policy_inputs": ("state", "networks see the state in the heading's frame"),
-    "yaw_copies": (0, "transitions turned by a random yaw enter the replay too"),
+    "yaw_copies": (0, "episodes turned by a random yaw are learned from too"),
     "reward": ("paper", "the reward's form is not p log R"),
     "reward_scale": (1.0, "the reward is scaled"),
     "shaping": (0.0, "the reward is shaped by a potential"),
@@ -216,7 +222,9 @@ _PAPER: dict[str, tuple[Any, str]] = {
     "learning_rate": (3e-4, "Adam's rate is not 3e-4"),
     "batch_size": (128, "the batch is not 128"),
     "replay_size": (1_000_000, "the replay does not hold 1e6 transitions"),
+    "replay_dtype": ("float32", "states in the replay are rounded to 16 bits"),
     "discount": (0.99, "γ is not 0.99"),
+    "return_steps": (1, "critics learn from returns of several steps"),
     "soft_update_rate": (0.005, "the soft update is not 0.005"),
     "initial_temperature": (0.2, "the temperature starts elsewhere than at 0.2"),
     "target_entropy_scale": (1.0, "the target entropy is not minus the number of actions"),
@@ -244,7 +252,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         learning_rate=1e-3,
         initial_temperature=0.1,
         restart_temperature=True,
-        replay_size=240_000,
+        replay_size=120_000,
     ),
     "paper": dict(
         num_iterations=20,
@@ -345,6 +353,7 @@ _CHOICES = {
     "reward": REWARDS,
     "policy_inputs": INPUTS,
     "shaping_space": SPACES,
+    "replay_dtype": REPLAY_DTYPES,
     "weights": WEIGHTS,
     "reference": REFERENCES,
     "start": STARTS,
@@ -352,7 +361,7 @@ _CHOICES = {
 _AT_LEAST_ONE = (
     *("num_seeds", "num_iterations", "steps_per_iteration", "num_envs", "num_segments"),
     *("episode_length", "num_starts", "num_neighbors", "reference_size", "mixture_episodes"),
-    *("hidden_layers", "hidden_size", "batch_size", "replay_size"),
+    *("hidden_layers", "hidden_size", "batch_size", "replay_size", "return_steps"),
 )
 _POSITIVE = (
     *("updates_per_step", "torque_limit", "reward_distance", "reward_scale", "learning_rate"),
@@ -427,9 +436,13 @@ def _check_together(c: Config) -> None:
             f"batch-size is {c.batch_size}, but must not exceed replay-size = {c.replay_size}.",
         ),
         (
-            c.num_envs * (1 + c.yaw_copies) > c.replay_size,
-            f"replay-size is {c.replay_size}, but one step of all envs and their yaw copies adds "
-            f"{c.num_envs * (1 + c.yaw_copies)}.",
+            4 * c.num_envs > c.replay_size,
+            f"replay-size is {c.replay_size}, but must hold four steps of all envs, "
+            f"{4 * c.num_envs}.",
+        ),
+        (
+            c.yaw_copies and c.replay_dtype != "float32",
+            f"replay-dtype is {c.replay_dtype}, but yaw copies need states in float32.",
         ),
         (
             c.mixture_episodes < c.archive_size,

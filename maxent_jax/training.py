@@ -5,28 +5,19 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from maxent_jax import rewards
+from maxent_jax import experience, rewards
 from maxent_jax.density import histogram, reservoir
-from maxent_jax.density.knn import knn_distances
 from maxent_jax.density.reservoir import Reservoir
 from maxent_jax.envs import base
 from maxent_jax.envs.base import Episodes
+from maxent_jax.experience import Reference
 from maxent_jax.methods import Method
 from maxent_jax.parts import Parts
 from maxent_jax.sac import agent as sac_agent
-from maxent_jax.sac import losses, replay
+from maxent_jax.sac import losses
 from maxent_jax.sac.agent import Agent
 from maxent_jax.sac.replay import Replay
-from maxent_jax.types import Experience, Metrics, Transition
-
-POSITION_DIMS = 2  # the features that are metres, first in every feature map
-
-
-class Reference(NamedTuple):
-    """The states that define r_t; the first `num_filled` points are there."""
-
-    points: jax.Array  # [M, F]
-    num_filled: jax.Array  # [] int32
+from maxent_jax.types import Metrics, Outcomes, Transition
 
 
 class Visits(NamedTuple):
@@ -41,6 +32,7 @@ class Learner(NamedTuple):
 
     agent: Agent
     replay: Replay
+    place: jax.Array  # [N] int32, where the replay finds each env's state: see experience.Step
     episodes: Episodes  # [N] of the agent; then, with the random baseline, [N] of that
     memory: jax.Array | None  # [N, T, F] states of each episode so far, for the episodic term
     reference: Reference
@@ -57,8 +49,7 @@ def init(parts: Parts, key: jax.Array) -> Learner:
     key_agent, key_episodes = jax.random.split(key)
     num_rows = config.num_envs * (2 if config.random_baseline else 1)
     dims = len(parts.phi.names)
-    scalar, state = jnp.zeros(()), jnp.zeros(sac.observation_size)
-    action = jnp.zeros(sac.action_size)
+    episodes = base.init(parts.env, num_rows, config.num_starts, key_episodes)
     memory = None
     if config.episodic_weight > 0:
         memory = jnp.zeros((config.num_envs, config.episode_length, dims))
@@ -66,8 +57,9 @@ def init(parts: Parts, key: jax.Array) -> Learner:
     unvisited = Visits(jnp.zeros(parts.grid.bins, jnp.int32), zero)
     return Learner(
         agent=sac_agent.init(sac, key_agent),
-        replay=replay.init(Experience(state, action, state, *([scalar] * 5)), config.replay_size),
-        episodes=base.init(parts.env, num_rows, config.num_starts, key_episodes),
+        replay=experience.init(parts),
+        place=-1 - episodes.start[: config.num_envs],
+        episodes=episodes,
         memory=memory,
         reference=Reference(jnp.zeros((config.reference_size, dims)), zero),
         history=reservoir.init(config.reference_size, dims),
@@ -100,10 +92,13 @@ def step(parts: Parts, method: Method, learner: Learner, key: jax.Array) -> tupl
     history = reservoir.add(learner.history, features, transition.valid, key_history)
     reference = _refreshed(parts, method, learner, history)
     bonus, memory = _episodic(parts, learner.memory, transition, features, age)
-    experience, valid = _with_yaw_copies(parts, transition, bonus, key_yaw)
-    ring = replay.add(learner.replay, measure(parts, reference, experience), valid)
+    ring, rows = experience.add(
+        parts, reference, learner.replay, transition, learner.place, bonus, key_yaw
+    )
+    ended = transition.terminated | transition.truncated
     learner = learner._replace(
         replay=ring,
+        place=jnp.where(ended, -1 - episodes.start[: config.num_envs], rows),
         episodes=episodes,
         memory=memory,
         reference=reference,
@@ -117,37 +112,14 @@ def step(parts: Parts, method: Method, learner: Learner, key: jax.Array) -> tupl
     if parts.torso is not None:
         flipped = parts.torso.flipped(transition.next_observation)
         metrics["flipped_share"] = jnp.mean(flipped.astype(jnp.float32))
+    reached = ring.items.distances.reached.at[rows, 0].get(mode="fill", fill_value=0.0)
     metrics |= {
+        "step_reward": jnp.mean(unshaped_reward(parts, reached)),
         "num_deaths": jnp.sum(transition.terminated, dtype=jnp.int32),
         "num_time_limits": jnp.sum(transition.truncated, dtype=jnp.int32),
         "num_invalid": jnp.sum(~everyone.valid, dtype=jnp.int32),
     }
     return learner, metrics
-
-
-def measure(parts: Parts, reference: Reference, experience: Experience) -> Experience:
-    """The experience [B, ...] with its distances to the reference, in place of any it had."""
-    config = parts.config
-
-    def distance(features):
-        dims = features.shape[1]
-        nearest = knn_distances(
-            features, reference.points[:, :dims], config.num_neighbors, count=reference.num_filled
-        )
-        return nearest[:, -1]
-
-    after = parts.phi(experience.next_observation)
-    experience = experience._replace(distance=distance(after))
-    if config.shaping == 0:
-        return experience
-    before = parts.phi(experience.observation)
-    if config.shaping_space == "features":
-        return experience._replace(
-            potential_distance=distance(before), next_potential_distance=experience.distance
-        )
-    ends = jnp.concatenate([before, after])[:, :POSITION_DIMS]
-    at_start, at_end = jnp.split(distance(ends), 2)
-    return experience._replace(potential_distance=at_start, next_potential_distance=at_end)
 
 
 def unshaped_reward(parts: Parts, distance: jax.Array) -> jax.Array:
@@ -158,22 +130,37 @@ def unshaped_reward(parts: Parts, distance: jax.Array) -> jax.Array:
     )
 
 
-def reward(parts: Parts, experience: Experience) -> jax.Array:
-    """What SAC is paid for a transition, [...]: r_t, its shaping, and the episodic term."""
+def reward(parts: Parts, outcomes: Outcomes) -> jax.Array:
+    """What SAC is paid for each step, [...]: r_t, its shaping, and the episodic term."""
     config = parts.config
-    form = unshaped_reward(parts, experience.distance)
-    paid = form + config.episodic_weight * experience.bonus
+    distances = outcomes.distances
+    paid = unshaped_reward(parts, distances.reached) + config.episodic_weight * outcomes.bonus
     if config.shaping > 0:
         paid = rewards.shaped(
             paid,
-            potential=config.shaping * unshaped_reward(parts, experience.potential_distance),
-            next_potential=config.shaping
-            * unshaped_reward(parts, experience.next_potential_distance),
+            potential=config.shaping * unshaped_reward(parts, distances.potential),
+            next_potential=config.shaping * unshaped_reward(parts, distances.next_potential),
             discount=config.discount,
-            alive=experience.discount,
+            alive=1.0 - outcomes.terminated,
             survives_death=config.shaping_survives_death,
         )
     return config.reward_scale * paid
+
+
+def returns(outcomes: Outcomes, paid: jax.Array, discount: float) -> tuple[jax.Array, jax.Array]:
+    """The discounted sum of what was paid, [...], and the factor on γ V(s') beyond, [...].
+
+    With n steps the entropy of the policy counts from the last state on, as usual in n-step SAC.
+
+    Args:
+      paid: [..., n].
+      discount: γ.
+    """
+    taken = outcomes.taken.astype(jnp.float32)
+    before = jax.lax.broadcasted_iota(jnp.float32, paid.shape, paid.ndim - 1)
+    terminated = jnp.any(outcomes.terminated & outcomes.taken, axis=-1)
+    beyond = discount ** (jnp.sum(taken, -1) - 1) * (1.0 - terminated)
+    return jnp.sum(paid * taken * discount**before, axis=-1), beyond
 
 
 def _refreshed(parts: Parts, method: Method, learner: Learner, history: Reservoir) -> Reference:
@@ -204,36 +191,6 @@ def _episodic(parts, memory, transition: Transition, features, age):
     return rewards.episodic_bonus(features, memory, age + 1, config.num_neighbors), memory
 
 
-def _with_yaw_copies(parts: Parts, transition: Transition, bonus: jax.Array, key: jax.Array):
-    """Experience [N·(1 + copies), ...], unmeasured, and which of its rows are valid."""
-    config = parts.config
-    unmeasured = jnp.zeros(config.num_envs)
-    original = Experience(
-        observation=transition.observation,
-        action=transition.action,
-        next_observation=transition.next_observation,
-        discount=1.0 - transition.terminated.astype(jnp.float32),
-        bonus=bonus,
-        distance=unmeasured,
-        potential_distance=unmeasured,
-        next_potential_distance=unmeasured,
-    )
-    angles = jax.random.uniform(
-        key, (config.yaw_copies, config.num_envs), minval=-jnp.pi, maxval=jnp.pi
-    )
-    copies = [_turned(parts, original, angle) for angle in angles]
-    experience = jax.tree.map(lambda *rows: jnp.concatenate(rows), original, *copies)
-    return experience, jnp.tile(transition.valid, 1 + config.yaw_copies)
-
-
-def _turned(parts: Parts, experience: Experience, angle: jax.Array) -> Experience:
-    assert parts.torso is not None and parts.torso.rotate is not None  # checked by Config
-    return experience._replace(
-        observation=parts.torso.rotate(experience.observation, angle),
-        next_observation=parts.torso.rotate(experience.next_observation, angle),
-    )
-
-
 def _visit(parts: Parts, visits: Visits, transition: Transition) -> Visits:
     grid = parts.grid
     valid = transition.valid.astype(jnp.int32)
@@ -248,19 +205,18 @@ def _learn(
     config = parts.config
     shape = (config.updates_per_vector_step, config.batch_size)
     key_sample, key_update = jax.random.split(key)
-    drawn = replay.sample(learner.replay, (shape[0] * shape[1],), key_sample)
+    drawn = experience.sample(parts, learner.replay, learner.episodes.starts.obs, shape, key_sample)
     # Stored distances hold while the reference does; the branch touches the drawn rows alone.
-    drawn = jax.lax.cond(
+    distances = jax.lax.cond(
         _changes_within_iteration(method),
-        lambda experience: measure(parts, learner.reference, experience),
-        lambda experience: experience,
-        drawn,
+        lambda x: experience.measure(parts, learner.reference, x.features, x.next_features),
+        lambda x: x.distances,
+        drawn.outcomes,
     )
-    paid = reward(parts, drawn)
-    batches = losses.Batch(
-        drawn.observation, drawn.action, paid, drawn.next_observation, drawn.discount
-    )
-    batches = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), batches)
+    outcomes = drawn.outcomes._replace(distances=distances)
+    paid = reward(parts, outcomes)
+    total, beyond = returns(outcomes, paid, config.discount)
+    batches = losses.Batch(drawn.observation, drawn.action, total, drawn.next_observation, beyond)
 
     def update(agent, batch_and_key):
         return sac_agent.update(parts.sac, agent, *batch_and_key)
@@ -268,10 +224,9 @@ def _learn(
     keys = jax.random.split(key_update, shape[0])
     agent, metrics = jax.lax.scan(update, learner.agent, (batches, keys))
     metrics = jax.tree.map(jnp.mean, metrics)
-    unshaped = jnp.mean(unshaped_reward(parts, drawn.distance))
     metrics |= {
-        "replay_reward": unshaped,
-        "replay_paid": jnp.mean(paid),
-        "replay_bonus": jnp.mean(drawn.bonus),
+        "replay_reward": jnp.mean(unshaped_reward(parts, distances.reached[..., 0])),
+        "replay_paid": jnp.mean(paid[..., 0]),
+        "replay_bonus": jnp.mean(outcomes.bonus[..., 0]),
     }
     return learner._replace(agent=agent), metrics

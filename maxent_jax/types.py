@@ -39,17 +39,29 @@ class Transition(NamedTuple):
     valid: jax.Array  # [...] bool
 
 
+class Distances(NamedTuple):
+    """Of a transition's ends to the reference that defines r_t, feature units."""
+
+    reached: jax.Array  # [...] R(s')
+    potential: jax.Array  # [...] R(s) in the space of the potential; 0 without shaping
+    next_potential: jax.Array  # [...] the same of s'
+
+
+class Outcomes(NamedTuple):
+    """What n steps in a row of one episode brought, the first `taken` of them."""
+
+    features: jax.Array  # [..., n, F] of the state left
+    next_features: jax.Array  # [..., n, F] of the state reached
+    bonus: jax.Array  # [..., n] episodic term, feature units
+    terminated: jax.Array  # [..., n] bool
+    distances: Distances  # [..., n]
+    taken: jax.Array  # [..., n] bool
+
+
 class Experience(NamedTuple):
-    """What the replay holds of a transition.
+    """What the learner draws from the replay, see experience.py: n steps of one episode."""
 
-    The distances are to the current reference; they are measured anew when it changes.
-    """
-
-    observation: jax.Array  # [..., D]
-    action: jax.Array  # [..., A], in [-1, 1]
-    next_observation: jax.Array  # [..., D]
-    discount: jax.Array  # [...] 0 where health failed, else 1
-    bonus: jax.Array  # [...] episodic term, feature units
-    distance: jax.Array  # [...] R(s'), feature units
-    potential_distance: jax.Array  # [...] R(s) in the space of the potential; 0 without shaping
-    next_potential_distance: jax.Array  # [...] the same of s'
+    observation: jax.Array  # [..., D] before the first
+    action: jax.Array  # [..., A] the first, in [-1, 1]
+    next_observation: jax.Array  # [..., D] after the last that was taken
+    outcomes: Outcomes  # [..., n]

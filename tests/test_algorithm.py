@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from maxent_jax import algorithm, mixture, parts, training
+from maxent_jax import algorithm, experience, mixture, parts, training
 from maxent_jax.config import preset
 
 TINY = dict(num_segments=1, mixture_episodes=4, num_iterations=3, shaping=1.0, backend="mujoco")
@@ -87,8 +87,8 @@ def test_two_seeds_by_vmap_equal_two_single_runs():
         learner = jax.tree.map(lambda x, i=index: x[i], together.learner)
         for a, b in (
             (learner.agent.parameters, alone.learner.agent.parameters),
-            (learner.replay.items.next_observation, alone.learner.replay.items.next_observation),
-            (learner.replay.items.distance, alone.learner.replay.items.distance),
+            (learner.replay.items.state, alone.learner.replay.items.state),
+            (learner.replay.items.distances, alone.learner.replay.items.distances),
             (learner.reference.points, alone.learner.reference.points),
         ):
             jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4), a, b)
@@ -138,12 +138,13 @@ def test_a_frozen_reference_leaves_every_stored_distance_current(method):
     assert leaves_equal(begun.learner.reference, trained.learner.reference)
     ring = trained.learner.replay
     assert int(ring.size) == 800  # half of it from before the refresh
-    stored = jax.tree.map(lambda x: x[: int(ring.size)], ring.items)
-    measured = training.measure(parts.make(config), trained.learner.reference, stored)
-    for name in ("distance", "potential_distance", "next_potential_distance"):
-        assert (getattr(stored, name) > 0).any()
+    anew = experience.measure_all(
+        parts.make(config), trained.learner.reference, ring, trained.learner.episodes.starts.obs
+    )
+    for name, stored in ring.items.distances._asdict().items():
+        assert (stored[: int(ring.size)] > 0).any()
         # the blocks of the two programs differ, hence the last bits
-        np.testing.assert_allclose(getattr(measured, name), getattr(stored, name), rtol=1e-5)
+        np.testing.assert_allclose(getattr(anew.items.distances, name), stored, rtol=1e-5)
 
 
 def test_la_learns_from_the_current_reference_whatever_the_replay_has_stored():
@@ -151,8 +152,9 @@ def test_la_learns_from_the_current_reference_whatever_the_replay_has_stored():
     step = compiled_step(config.program())
     learner, key = state.learner, jax.random.key(1)
     items = learner.replay.items
+    poison = jax.tree.map(lambda x: x + 1e6, items.distances)
     poisoned = learner._replace(
-        replay=learner.replay._replace(items=items._replace(distance=items.distance + 1e6))
+        replay=learner.replay._replace(items=items._replace(distances=poison))
     )
     clean_after, _ = step(state.method, learner, key)
     poisoned_after, _ = step(state.method, poisoned, key)
@@ -182,7 +184,7 @@ def test_the_history_holds_what_was_visited():
     config, _, _, _, trained = stages("la")
     p = parts.make(config)
     ring = trained.learner.replay
-    visited = np.asarray(p.phi(ring.items.next_observation[: int(ring.size)]))
+    visited = np.asarray(p.phi(ring.items.state[: int(ring.size)]))
     history = np.asarray(trained.learner.history.points)
     # Before there is a history the first rollouts stand in for one; some of them may remain.
     close = (np.abs(history[:, None] - visited[None]).max(-1) < 1e-5).any(1)

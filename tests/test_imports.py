@@ -17,7 +17,16 @@ ORDER = [
     *("envs.ant", "envs.walker2d", "envs.humanoid", "envs.pendulum", "envs.mountain_car"),
     *("envs", "envs.base", "rollout", "features"),
     *("rewards", "sac.networks", "sac.replay", "sac.losses", "sac.agent", "mixture", "methods"),
-    *("parts", "occupancy", "training", "algorithm", "checkpoint", "analysis", "plotting"),
+    *(
+        "parts",
+        "occupancy",
+        "experience",
+        "training",
+        "algorithm",
+        "checkpoint",
+        "analysis",
+        "plotting",
+    ),
 ]
 
 

@@ -160,9 +160,10 @@ def test_heading_inputs_see_the_world_from_the_ant():
     observation = np.arange(29, dtype=np.float32)
     observation[:7] = distance * east, distance * north, 0.6, np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
     observation[15:18] = speed * east, speed * north, 0.5
+    far = np.log(1 + distance / 10)
     expected = np.concatenate(
         [
-            *([2 * east, 2 * north], [2, 0], [distance / (distance + 0.1), 0], [north, east]),
+            *([far * east, far * north], [far, 0], [distance / (distance + 0.1), 0], [north, east]),
             *([0.6], [0, 0, 1], [speed, 0, 0.5], range(7, 15), range(18, 29)),
         ]
     )

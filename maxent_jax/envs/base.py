@@ -21,6 +21,7 @@ class Episodes(NamedTuple):
 
     env: State  # [N, ...]
     age: jax.Array  # [N] int32, control steps since the episode's start
+    start: jax.Array  # [N] int32, the start from which each began
     starts: State  # [R, ...] random starts, R far larger than N: one cached start biases entropy
 
 
@@ -28,18 +29,18 @@ def init(env: Env, num_envs: int, num_starts: int, key: jax.Array) -> Episodes:
     """N fresh episodes and a pool of `num_starts` random starts."""
     key_starts, key_draw = jax.random.split(key)
     starts = jax.vmap(env.reset)(jax.random.split(key_starts, num_starts))
+    start = _draw_rows(starts, num_envs, key_draw)
     return Episodes(
-        env=draw_starts(starts, num_envs, key_draw),
+        env=_rows(starts, start),
         age=jnp.zeros(num_envs, jnp.int32),
+        start=start,
         starts=starts,
     )
 
 
 def draw_starts(starts: State, num: int, key: jax.Array) -> State:
     """[num, ...] of the pool's starts, each drawn on its own."""
-    pool_size = starts.done.shape[0]
-    rows = jax.random.randint(key, (num,), 0, pool_size)
-    return jax.tree.map(lambda x: x[rows], starts)
+    return _rows(starts, _draw_rows(starts, num, key))
 
 
 def step(
@@ -68,10 +69,11 @@ def step(
         valid=valid,
     )
     ended = terminated | truncated
-    fresh = draw_starts(episodes.starts, age.shape[0], key)
+    start = _draw_rows(episodes.starts, age.shape[0], key)
     return Episodes(
-        env=select_rows(ended, fresh, after),
+        env=select_rows(ended, _rows(episodes.starts, start), after),
         age=jnp.where(ended, 0, age),
+        start=jnp.where(ended, start, episodes.start),
         starts=episodes.starts,
     ), transition
 
@@ -90,3 +92,11 @@ def finite_rows(state: State) -> jax.Array:
     rows = state.done.shape[0]
     floats = [x for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)]
     return jnp.stack([jnp.isfinite(x).reshape(rows, -1).all(-1) for x in floats]).all(0)
+
+
+def _draw_rows(starts: State, num: int, key: jax.Array) -> jax.Array:
+    return jax.random.randint(key, (num,), 0, starts.done.shape[0])
+
+
+def _rows(states: State, rows: jax.Array) -> State:
+    return jax.tree.map(lambda x: x[rows], states)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-POSITION_UNIT = 10.0  # metres that count as 1 among the policy's inputs
+POSITION_UNIT = 10.0  # metres; a policy sees distances beyond it by their logarithm
 
 
 class Torso(NamedTuple):
@@ -53,20 +53,22 @@ def heading_inputs(observation: jax.Array, num_positions: int, num_velocities: i
     """The same state in the robot's own horizontal frame, where walking looks alike everywhere.
 
     Returns [..., 5 + num_positions + num_velocities]: position, position seen from the heading,
-    direction outward, heading, height, up-axis, velocities and joints; lengths of tens of metres
-    are brought to order 1. What is observed beyond positions and velocities is left out.
+    direction outward, heading, height, up-axis, velocities and joints. A distance ρ from the
+    origin enters as log(1 + ρ / POSITION_UNIT): a policy meets a state farther out than it has been
+    as nearly one that it knows. What is observed beyond positions and velocities is left out.
     """
     w, x, y, z = _quaternion(observation)
     yaw = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     position = observation[..., :2]
     seen = _turn(position, -yaw)
-    radius = jnp.sqrt(jnp.sum(position**2, -1, keepdims=True))
+    radius = jnp.linalg.norm(position, axis=-1, keepdims=True)
+    shrink = jnp.log1p(radius / POSITION_UNIT) / jnp.maximum(radius, 1e-6)
     up = up_axis(observation)
     velocity = observation[..., num_positions : num_positions + num_velocities]
     return jnp.concatenate(
         [
-            position / POSITION_UNIT,
-            seen / POSITION_UNIT,
+            shrink * position,
+            shrink * seen,
             seen / (radius + 0.1),  # bounded, and continuous at the origin
             jnp.stack([jnp.sin(yaw), jnp.cos(yaw)], -1),
             observation[..., 2:3],
