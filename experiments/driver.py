@@ -1,5 +1,7 @@
 """Runs the three programs of an iteration, and logs, saves and draws in between."""
 
+import multiprocessing
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -9,21 +11,27 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from maxent_jax import algorithm, checkpoint, methods, parts, plotting, runs, runtime
+from experiments import hosts
+from experiments.cli import UsageError
+from maxent_jax import algorithm, checkpoint, devices, methods, parts, plotting, runs, runtime
 from maxent_jax.algorithm import Programs, State
 from maxent_jax.analysis import load_run, paths
 from maxent_jax.config import Config
 from maxent_jax.density import histogram
 
 
-def train(config: Config, directory: Path, process_started: float) -> None:
+def train(config: Config, directory: Path, process_started: float, num_devices: int = 1) -> None:
     """Trains to the end, from the last complete checkpoint if there is one.
 
     Args:
       directory: exists; empty, or with this very run in it.
       process_started: time.perf_counter() when the program began, for the time to the first step.
+      num_devices: that share the run; 0: all.
+    Raises:
+      UsageError, ConfigError: no such share.
     """
     runtime.prepare(config.simulates_in_jax)
+    placed = _placement(config, num_devices)
     completed = checkpoint.latest_step(directory) or 0
     if completed == config.num_iterations:
         if not plotting.all_saved(directory):  # killed after its last checkpoint
@@ -31,24 +39,42 @@ def train(config: Config, directory: Path, process_started: float) -> None:
         print(f"{directory} is complete: nothing to train.")
         return
     if completed:
-        state = checkpoint.restore(directory, config)
+        state = checkpoint.restore(directory, config, placed)
     else:
-        machine = {
-            "backend": parts.make(config).env.backend,
-            "device": jax.devices()[0].device_kind,
-        }
-        runs.write_config(directory, config, methods.row(config)._asdict(), machine)
-        state = algorithm.start(config)
-    rows = runs.truncate_metrics(directory, completed)
+        state = algorithm.start(config) if placed is None else devices.start(config, placed)
+        hosts.first_alone(lambda: _write_config(config, directory))
+    rows = runs.read_metrics(directory)[:completed]
+    hosts.first_alone(lambda: runs.truncate_metrics(directory, completed))
     clock = _Clock(process_started, rows[-1] if rows else {})
-    programs = algorithm.programs(config)
+    programs = algorithm.programs(config, placed)
     with _Bar(config, completed) as bar:
-        for _ in range(completed, config.num_iterations):
+        for iteration in range(completed, config.num_iterations):
             state, row = _iterate(config, programs, state, clock, bar)
-            runs.append_metrics(directory, row)
-            checkpoint.save(directory, state)
-    _draw(directory)
-    _summarise(directory, rows=runs.read_metrics(directory))
+            if hosts.is_first():
+                runs.append_metrics(directory, row)
+            checkpoint.save(directory, state, iteration + 1)
+    if hosts.is_first():
+        _draw(directory)
+        _summarise(directory, rows=runs.read_metrics(directory))
+
+
+def _placement(config: Config, num_devices: int) -> State | None:
+    """Of the state on that many devices, 0 for all; None for one."""
+    available = jax.devices()
+    if num_devices > len(available):
+        raise UsageError(f"devices is {num_devices}, but there are {len(available)}.")
+    chosen = available[: num_devices or None]
+    if len(chosen) == 1:
+        return None
+    return devices.placement(config, devices.make_mesh(config, chosen))
+
+
+def _write_config(config: Config, directory: Path) -> None:
+    machine = {
+        "backend": parts.make(config).env.backend,
+        "device": jax.devices()[0].device_kind,
+    }
+    runs.write_config(directory, config, methods.row(config)._asdict(), machine)
 
 
 def _iterate(
@@ -148,6 +174,18 @@ class _Bar:
 
 
 def _draw(directory: Path) -> None:
+    """The figures. Beside other processes, whose devices are out of reach, in one of its own."""
+    if jax.process_count() == 1:
+        draw(directory)
+        return
+    alone = multiprocessing.get_context("spawn").Process(target=draw, args=(directory,))
+    os.environ["JAX_PLATFORMS"] = "cpu"  # of the child: the accelerator's memory is taken
+    alone.start()
+    alone.join()
+
+
+def draw(directory: Path) -> None:
+    """Rolls the archived policies out, and draws the figures of a run."""
     run = load_run(directory)
     visited = run.occupancy()
     cells = histogram.count(visited.states, run.parts.grid, visited.weight)

@@ -5,6 +5,7 @@ figures/. `--resume` goes on from the last complete checkpoint.
 """
 
 import dataclasses
+import re
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +24,15 @@ class Arguments:
     """The run's directory; runs/ENV-METHOD-PRESET-SEED when left out."""
     resume: bool = False
     """Go on from the last complete checkpoint in the run's directory; start over without one."""
+    devices: int = 1
+    """Devices that share the run: seeds first, then environments. 0: all there are."""
+    coordinator: str = ""
+    """HOST:PORT of the first of several processes, or auto under SLURM, Open MPI, Kubernetes and on
+    a TPU slice; see docs/clusters.md."""
+    num_processes: int = 1
+    """Processes of the run, with --coordinator HOST:PORT."""
+    process_id: int = 0
+    """Which of them this is, from 0."""
 
     @property
     def directory(self) -> Path:
@@ -32,7 +42,7 @@ class Arguments:
 
 
 def read_arguments(argv: Sequence[str]) -> Arguments:
-    """The checked arguments, and the directory known to be free or to hold this very run.
+    """The checked arguments.
 
     Raises:
       UsageError, ConfigError, RunError: one sentence each.
@@ -40,9 +50,27 @@ def read_arguments(argv: Sequence[str]) -> Arguments:
     env = cli.flag_value(argv, "--env") or Config.env
     config = preset(cli.flag_value(argv, "--preset") or Config.preset, env=env)
     arguments = cli.parse(Arguments, argv, "experiments.train", default=Arguments(config))
+    _check_hosts(arguments)
+    return arguments
+
+
+def claim_directory(arguments: Arguments) -> None:
+    """Makes the run's directory, unless it is there: then it is empty, or holds this very run.
+
+    Raises:
+      UsageError, RunError: it does not, or cannot be made.
+    """
     directory = arguments.directory
-    if not directory.exists() or (directory.is_dir() and not any(directory.iterdir())):
-        return arguments
+    if directory.is_file() or (directory.is_dir() and any(directory.iterdir())):
+        _check_resumed(arguments)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise cli.UsageError(f"cannot write to {directory}: {error.strerror}.") from None
+
+
+def _check_resumed(arguments: Arguments) -> None:
+    directory = arguments.directory
     if not arguments.resume:
         raise cli.UsageError(
             f"{directory} already exists: choose another --out, or add --resume to go on with it."
@@ -59,20 +87,53 @@ def read_arguments(argv: Sequence[str]) -> Arguments:
             for name in changed
         )
         raise cli.UsageError(f"{directory} holds a run with other settings: {listed}.")
-    return arguments
+
+
+def _check_hosts(arguments: Arguments) -> None:
+    coordinator, processes = arguments.coordinator, arguments.num_processes
+    for wrong, sentence in (
+        (
+            arguments.devices < 0,
+            f"devices is {arguments.devices}, but must be 0 (all) or more.",
+        ),
+        (
+            not coordinator and (processes, arguments.process_id) != (1, 0),
+            "num-processes and process-id need --coordinator HOST:PORT.",
+        ),
+        (
+            coordinator not in ("", "auto") and not re.fullmatch(r".+:\d+", coordinator),
+            f"coordinator is '{coordinator}', but must be HOST:PORT, or auto.",
+        ),
+        (
+            processes < 1 or not 0 <= arguments.process_id < processes,
+            f"process-id is {arguments.process_id}, but must be from 0 to below num-processes = "
+            f"{processes}.",
+        ),
+        (
+            coordinator and arguments.devices > 1,
+            "devices cannot be chosen with --coordinator: all devices of all processes take part.",
+        ),
+    ):
+        if wrong:
+            raise cli.UsageError(sentence)
 
 
 def main(argv: Sequence[str]) -> None:
     """Parses, checks, and only then loads jax."""
     started = time.perf_counter()
     arguments = read_arguments(argv)
-    try:
-        arguments.directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cli.UsageError(f"cannot write to {arguments.directory}: {error.strerror}.") from None
+    num_devices = arguments.devices
+    if arguments.coordinator:
+        from experiments import hosts  # loads jax
+
+        hosts.join(arguments.coordinator, arguments.num_processes, arguments.process_id)
+        hosts.first_alone(lambda: claim_directory(arguments))
+        num_devices = 0
+    else:
+        claim_directory(arguments)
     from experiments import driver  # loads jax
 
-    driver.train(arguments.config, arguments.directory, started)
+    driver.train(arguments.config, arguments.directory, started, num_devices)
 
 
 def run() -> None:

@@ -10,10 +10,11 @@ between calls the same three. A method is data in the state, so all methods shar
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import NamedSharding, PartitionSpec
 
 from maxent_jax import experience, methods, mixture, occupancy, parts, training
 from maxent_jax.config import Config
@@ -165,18 +166,31 @@ class Programs(NamedTuple):
     end: Callable[[State], tuple[State, Metrics]]
 
 
-def programs(config: Config) -> Programs:
-    """What a driver calls to log and save in between; compiled once for each program."""
-    return _programs(config.program(), config.num_seeds > 1)
+def programs(config: Config, placed: State | None = None) -> Programs:
+    """What a driver calls to log and save in between; compiled once for each program.
+
+    Args:
+      placed: the sharding of each leaf of the state, see devices.placement; one device if left out.
+    """
+    program, seed_axis = config.program(), config.num_seeds > 1
+    if placed is None:
+        return _on_one_device(program, seed_axis)
+    (mesh,) = {leaf.mesh for leaf in jax.tree.leaves(placed)}
+    metrics = NamedSharding(mesh, PartitionSpec())
+    return _programs(program, seed_axis, in_shardings=(placed,), out_shardings=(placed, metrics))
 
 
 @functools.lru_cache(maxsize=8)
-def _programs(config: Config, seed_axis: bool) -> Programs:
+def _on_one_device(config: Config, seed_axis: bool) -> Programs:
+    return _programs(config, seed_axis)
+
+
+def _programs(config: Config, seed_axis: bool, **shardings: Any) -> Programs:
     def compiled(f):
         f = functools.partial(f, config)
         if seed_axis:
             f = jax.vmap(f, in_axes=(SEED_AXES,), out_axes=(SEED_AXES, 0))
-        return jax.jit(f, donate_argnums=0)
+        return jax.jit(f, donate_argnums=0, **shardings)
 
     return Programs(compiled(begin), compiled(train_segment), compiled(end))
 

@@ -29,9 +29,14 @@ class Results(NamedTuple):
     random_visits: Visits
 
 
-def save(run_directory: Path, state: State) -> None:
-    """Writes the state; complete or, to all who look, not there. Older steps go."""
-    step = int(jax.numpy.ravel(state.iteration)[0])
+def save(run_directory: Path, state: State, step: int) -> None:
+    """Writes the state; complete or, to all who look, not there. Older steps go.
+
+    With several processes each calls it, and writes its part of the state.
+
+    Args:
+      step: iterations completed.
+    """
     with _open(run_directory, cleanup_tmp_directories=True) as checkpointer:
         checkpointer.save_checkpointables(step, _items(_without_typed_key(state)), overwrite=True)
 
@@ -44,13 +49,15 @@ def latest_step(run_directory: Path) -> int | None:
         return None if checkpointer.latest is None else checkpointer.latest.step
 
 
-def restore(run_directory: Path, config: Config) -> State:
-    """The state of the last complete step.
+def restore(run_directory: Path, config: Config, placed: State | None = None) -> State:
+    """The state of the last complete step, on whatever devices it was saved from.
 
+    Args:
+      placed: the sharding of each leaf, see devices.placement; one device if left out.
     Raises:
       CheckpointError: there is none.
     """
-    items = _load(run_directory, _items(_abstract(config)))
+    items = _load(run_directory, _items(_abstract(config, placed)))
     results, rest = items["results"], items["rest"]
     learner = rest.learner._replace(visits=results.visits, random_visits=results.random_visits)
     key = jax.random.wrap_key_data(rest.key)
@@ -81,10 +88,16 @@ def _without_typed_key(state: State) -> State:
     return state._replace(key=jax.random.key_data(state.key))
 
 
-def _abstract(config: Config) -> State:
-    device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+def _abstract(config: Config, placed: State | None = None) -> State:
     shapes = jax.eval_shape(lambda: _without_typed_key(algorithm.start(config)))
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=device), shapes)
+    if placed is None:
+        device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+        placed = jax.tree.map(lambda _: device, shapes)
+    return jax.tree.map(
+        lambda x, sharding: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding),
+        shapes,
+        placed,
+    )
 
 
 def _load(run_directory: Path, abstract: dict[str, Any]) -> dict[str, Any]:

@@ -145,6 +145,7 @@ def test_resume_without_a_checkpoint_starts_over(tmp_path):
     runs.write_config(tmp_path, config, {}, {})
     (tmp_path / "metrics.jsonl").write_text('{"iteration": 1}\n{"itera')
     resumed = train.read_arguments(["--preset", "smoke", "--out", str(tmp_path), "--resume"])
+    train.claim_directory(resumed)
     driver.train(resumed.config, resumed.directory, time.perf_counter())
     assert [row["env_steps"] for row in runs.read_metrics(tmp_path)] == [400, 800]
 

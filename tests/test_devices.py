@@ -1,0 +1,172 @@
+"""A run on eight simulated devices against the same on one, and on two processes, one of them lost.
+
+Each in processes of their own: jax reads the number of devices once.
+"""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from maxent_jax import runs
+from maxent_jax.config import ConfigError, preset
+from maxent_jax.devices import make_mesh
+
+ROOT = Path(__file__).parent.parent
+SMOKE = ("--preset", "smoke", "--env", "pendulum", "--num-iterations", "4")
+
+# 5 steps of 16 envs with an update each, as several programs round apart.
+ON_EIGHT_DEVICES = """
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from maxent_jax import algorithm, checkpoint, devices, runtime
+from maxent_jax.config import preset
+
+runtime.prepare(simulates_in_jax=False)
+env, num_seeds, directory = sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])
+config = preset(
+    "smoke", env=env, num_seeds=num_seeds, num_envs=16, steps_per_iteration=80,
+    updates_per_step=1 / 16, num_segments=1, episode_length=50, num_iterations=1,
+    reference_size=64, shaping=1.0,
+)
+mesh = devices.make_mesh(config, jax.devices())
+placed = devices.placement(config, mesh)
+one, many = algorithm.start(config), devices.start(config, placed)
+
+def numbers(leaf):
+    typed = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return np.asarray(jax.random.key_data(leaf) if typed else leaf)
+
+def compare(a, b):
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    for x, y in ((numbers(x), numbers(y)) for x, y in pairs):
+        if np.issubdtype(x.dtype, np.floating):
+            np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4)
+        else:
+            np.testing.assert_array_equal(x, y)
+
+programs = algorithm.programs(config), algorithm.programs(config, placed)
+for on_one, on_many in zip(*programs, strict=True):
+    one, metrics_one = on_one(one)
+    many, metrics_many = on_many(many)
+    compare(one, many)
+    compare(metrics_one, metrics_many)
+
+state = many.learner.replay.items.state
+part = state.addressable_shards[0].data.shape
+print("part of the replay", state.size // np.prod(part), "of", dict(mesh.shape))
+capacity = config.replay_size
+program = programs[1].train_segment.lower(many).compile().as_text()
+for line in program.splitlines():  # no exchange has the replay's rows, whole or a device's part
+    if any(f" {kind}" in line for kind in ("all-gather", "all-to-all", "collective-permute")):
+        assert f"{capacity}," not in line.split("(")[0], line
+        assert f"{capacity // mesh.shape['envs']}," not in line.split("(")[0], line
+
+checkpoint.save(directory, many, 1)
+compare(one, checkpoint.restore(directory, config))
+compare(one, checkpoint.restore(directory, config, placed))
+print("equal")
+"""
+
+
+@pytest.mark.parametrize(
+    ("env", "num_seeds", "across"),
+    [("ant", 1, {"seeds": 1, "envs": 8}), ("pendulum", 4, {"seeds": 4, "envs": 2})],
+)
+def test_eight_devices_do_what_one_does(tmp_path, env, num_seeds, across):
+    flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
+    done = subprocess.run(
+        [sys.executable, "-c", ON_EIGHT_DEVICES, env, str(num_seeds), str(tmp_path)],
+        env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout == f"part of the replay 8 of {across}\nequal\n", done.stderr
+
+
+def start_two(directory, logs, *flags):
+    """Two processes of one run; each writes its errors to a file in the folder `logs`."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    where = ("--coordinator", f"localhost:{port}", "--num-processes", "2")
+    command = [sys.executable, "-m", "experiments.train", *SMOKE, "--out", str(directory), *where]
+    logs.mkdir()
+    processes = []
+    for index in range(2):
+        with open(logs / str(index), "w") as errors:
+            processes.append(
+                subprocess.Popen(
+                    [*command, "--process-id", str(index), *flags],
+                    cwd=ROOT,
+                    stdout=subprocess.DEVNULL,
+                    stderr=errors,
+                )
+            )
+    return processes
+
+
+def test_two_processes_train_one_run_and_end_together(tmp_path):
+    directory, logs = tmp_path / "run", tmp_path / "logs"
+    processes = start_two(directory, logs)
+    metrics = directory / runs.METRICS
+    deadline = time.time() + 120
+    while time.time() < deadline and not (metrics.exists() and metrics.read_text()):
+        time.sleep(0.1)
+    time.sleep(0.5)  # into the next iteration
+    processes[1].send_signal(signal.SIGKILL)
+    assert processes[0].wait(timeout=60) != 0  # raises where it lives on
+    processes[1].wait()
+
+    again = tmp_path / "again"
+    for index, process in enumerate(start_two(directory, again, "--resume")):
+        assert process.wait(timeout=240) == 0, (again / str(index)).read_text()
+    assert [row["env_steps"] for row in runs.read_metrics(directory)] == [400, 800, 1200, 1600]
+    assert (directory / "figures" / "curves.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--devices", "-1"), "devices is -1"),
+        (("--devices", "1000"), "devices is 1000, but there"),
+        (("--num-processes", "2"), "need --coordinator"),
+        (("--coordinator", "somewhere"), "HOST:PORT, or auto"),
+        (("--coordinator", "a:1", "--num-processes", "2", "--process-id", "2"), "process-id is 2"),
+        (("--coordinator", "a:1", "--devices", "2"), "devices cannot be chosen"),
+    ],
+)
+def test_a_share_that_cannot_be_is_one_sentence(tmp_path, flags, message):
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.train", *SMOKE, "--out", str(tmp_path / "run"), *flags],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert re.fullmatch(rf"error: .*{message}.*\n", done.stderr), done.stderr
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"num_envs": 6, "steps_per_iteration": 600, "updates_per_step": 0.5}, "num-envs is 6"),
+        ({"replay_size": 2001}, "replay-size is 2001"),
+    ],
+)
+def test_devices_share_a_seed_evenly(changes, message):
+    config = preset("smoke", env="pendulum", **changes)
+    with pytest.raises(ConfigError, match=f"{message}, but must be a multiple of 4"):
+        make_mesh(config, [None] * 4)
