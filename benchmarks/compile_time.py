@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmarks import common
 from maxent_jax import runs
-from maxent_jax.config import ENVS, preset
+from maxent_jax.config import ENVS, PRESETS, preset
 
 TRAIN = ("-m", "experiments.train", "--num-iterations", "1")
 
@@ -60,10 +60,11 @@ def measure(env: str, name: str, repeats: int) -> Iterator[dict[str, Any]]:
 def main() -> None:
     flags = common.parser(__doc__)
     flags.add_argument("--env", choices=ENVS, default="ant")
+    flags.add_argument("--preset", choices=list(PRESETS), default="quick")
     args = flags.parse_args()
     common.print_versions()
     toy = ("pendulum", "smoke", 1)
-    for row in list(measure(*(toy if args.toy else (args.env, "quick", args.repeats)))):
+    for row in list(measure(*(toy if args.toy else (args.env, args.preset, args.repeats)))):
         common.emit(row)
 
 

@@ -243,6 +243,8 @@ def main() -> None:
     flags.add_argument("--mujoco-envs", type=int, nargs="*", default=[16, 128, 1024])
     flags.add_argument("--mjx-envs", type=int, nargs="*", default=[64, 256])
     flags.add_argument("--warp-envs", type=int, nargs="*", default=[])
+    flags.add_argument("--mjx-physics", nargs="*", choices=PHYSICS, default=list(PHYSICS))
+    flags.add_argument("--no-peers", action="store_true", help="but bare mujoco.rollout")
     args = flags.parse_args()
     runtime.prepare(simulates_in_jax=True)
     common.print_versions(PEERS)
@@ -252,9 +254,9 @@ def main() -> None:
             (name, "mujoco", "reference", n, max(MIN_STEPS, MUJOCO_STEPS // n))
             for n in args.mujoco_envs
         ]
-        cases += [(name, "mjx", p, n, MIN_STEPS) for p in PHYSICS for n in args.mjx_envs]
+        cases += [(name, "mjx", p, n, MIN_STEPS) for p in args.mjx_physics for n in args.mjx_envs]
         cases += [(name, "warp", "reference", n, MIN_STEPS) for n in args.warp_envs]
-    peers = common.importable(PEERS)
+    peers = [] if args.no_peers else common.importable(PEERS)
     if args.toy:
         print("toy: without mjx, which compiles for tens of seconds", file=sys.stderr)
         cases = [("humanoid", "mujoco", "reference", 4, 4)]

@@ -43,6 +43,9 @@ def measure(name: str, settings: dict[str, Any], counts, repeats: int) -> Iterat
                 "env": config.env,
                 "preset": name,
                 "seeds": count,
+                "envs_of_each": config.num_envs,
+                "batch_size": config.batch_size,
+                "updates_per_step": config.updates_per_step,
                 "env_steps_per_second": rate,
                 "over_one_by_one": rate / first,
             }
@@ -54,6 +57,8 @@ def main() -> None:
     flags.add_argument("--env", choices=ENVS, default="ant")
     flags.add_argument("--backend", choices=BACKENDS, default="auto")
     flags.add_argument("--preset", choices=list(PRESETS), default="quick")
+    flags.add_argument("--num-envs", type=int, help="of a seed; the preset's where left out")
+    flags.add_argument("--batch-size", type=int, help="of a seed; the preset's where left out")
     flags.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 4, 8])
     args = flags.parse_args()
     runtime.prepare(simulates_in_jax=args.backend == "mjx")
@@ -62,6 +67,8 @@ def main() -> None:
         rows = measure("smoke", {"env": "pendulum"}, (1, 2), args.repeats)
     else:
         settings = {"env": args.env, "backend": args.backend}
+        sizes = {"num_envs": args.num_envs, "batch_size": args.batch_size}
+        settings |= {name: size for name, size in sizes.items() if size is not None}
         rows = measure(args.preset, settings, args.seeds, args.repeats)
     for row in list(rows):
         common.emit(row)

@@ -17,6 +17,7 @@ from maxent_jax import algorithm, checkpoint, devices, methods, parts, plotting,
 from maxent_jax.algorithm import Programs, State
 from maxent_jax.analysis import load_run, paths
 from maxent_jax.config import Config
+from maxent_jax.convergence import has_plateaued
 from maxent_jax.density import histogram
 
 
@@ -82,17 +83,38 @@ def _iterate(
 ) -> tuple[State, dict[str, Any]]:
     """algorithm.iterate, with the clock read and the bar moved between its parts."""
     state, at_begin = clock.time("wall_begin", programs.begin, state)
-    segments = []
-    for _ in range(config.num_segments):
+    segments: list[dict[str, Any]] = []
+    converged = False
+    while len(segments) < config.num_segments and not converged:
         state, metrics = clock.time("wall_train", programs.train_segment, state)
         segments.append(metrics)
         clock.first_step_done()
         bar.advance(metrics)
+        converged = _all_converged(config, segments)
     state, at_end = clock.time("wall_end", programs.end, state)
     stacked = jax.tree.map(lambda *x: np.stack(x), *segments)
-    row = {**at_end, **at_begin, **algorithm.reduce_metrics(stacked), **clock.row()}
+    rewards = np.full((*stacked["step_reward"].shape[1:], config.num_segments), np.nan)
+    rewards[..., : len(segments)] = np.moveaxis(stacked["step_reward"], 0, -1)
+    row = {
+        **at_end,
+        **at_begin,
+        **algorithm.reduce_metrics(stacked),
+        "segments_trained": len(segments),
+        "converged": converged,
+        "segment_reward": rewards,
+        **clock.row(),
+    }
     bar.iteration_done(row)
     return state, row
+
+
+def _all_converged(config: Config, segments: list[dict[str, Any]]) -> bool:
+    """Of all seeds, which train in step."""
+    rewards = np.stack([metrics["step_reward"] for metrics in segments], axis=-1)
+    return all(
+        has_plateaued(list(of_seed), config.plateau_segments, config.plateau_tolerance)
+        for of_seed in np.atleast_2d(rewards)
+    )
 
 
 class _Clock:
@@ -125,8 +147,15 @@ class _Clock:
             "wall_seconds": now - self._origin,
             "wall_first_step": self._first_step,  # to the end of the first segment
             "wall_train_total": self._train_total,
+            "wall_peak_bytes": _peak_bytes(),
             **parts,
         }
+
+
+def _peak_bytes() -> int | None:
+    """Of the first device's memory, where it keeps count: a GPU or a TPU."""
+    statistics = jax.local_devices()[0].memory_stats() or {}
+    return statistics.get("peak_bytes_in_use")
 
 
 class _Bar:
@@ -144,7 +173,7 @@ class _Bar:
             disable=not console.is_terminal,
         )
         self._iteration, self._coverage = completed, ""
-        self._num_iterations = config.num_iterations
+        self._num_iterations, self._num_segments = config.num_iterations, config.num_segments
         self._task = self._progress.add_task(
             "",
             total=config.num_iterations * config.num_segments,
@@ -170,6 +199,8 @@ class _Bar:
 
     def iteration_done(self, row: dict[str, Any]) -> None:
         self._iteration += 1
+        done = self._iteration * self._num_segments  # also where the iteration ended early
+        self._progress.update(self._task, completed=done)
         self._coverage = f" · {int(np.mean(row['cumulative_coverage'])):,} cells"
 
 

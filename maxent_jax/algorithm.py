@@ -5,7 +5,9 @@
     end            archive the agent, evaluate the mixture
 
 `iterate` composes them and `run` scans `iterate` as one program; a driver that logs and saves in
-between calls the same three. A method is data in the state, so all methods share one program.
+between calls the same three, and may end an iteration at a plateau (convergence.py), which a
+program that spends its whole budget cannot. A method is data in the state, so all methods share
+one program.
 """
 
 import functools

@@ -41,7 +41,7 @@ class Config:
     method: str = "v"
     """h (Hazan 2019), la (Liu & Abbeel 2021) or v (Veritas)."""
     preset: str = "quick"
-    """The values that the other flags start from: smoke, quick or paper."""
+    """The values that the other flags start from: smoke, quick, gpu or paper."""
     backend: str = "auto"
     """Physics: mjx, mujoco (C MuJoCo), warp (MuJoCo Warp), or auto: mujoco on a CPU, else mjx."""
     physics: str = "reference"
@@ -61,6 +61,11 @@ class Config:
     """N: environments stepped together."""
     num_segments: int = 15
     """Parts of an iteration; progress is shown after each."""
+    plateau_segments: int = 0
+    """End an iteration before its budget is spent once its reward has stopped rising, judged by
+    means over so many segments; 0: never."""
+    plateau_tolerance: float = 0.05
+    """What still counts as rising: a share of all that the reward rose in the iteration."""
 
     episode_length: int = 1000
     """Time limit, control steps."""
@@ -198,6 +203,7 @@ class Config:
 DATA_FIELDS = (
     *("method", "preset", "seed", "num_seeds"),
     *("weights", "eta", "reference", "refresh_period", "start"),
+    *("plateau_segments", "plateau_tolerance"),
 )
 _DEFAULTS = {field.name: field.default for field in dataclasses.fields(Config)}
 
@@ -254,6 +260,20 @@ PRESETS: dict[str, dict[str, Any]] = {
         restart_temperature=True,
         replay_size=120_000,
     ),
+    "gpu": dict(
+        num_iterations=20,
+        num_envs=2048,
+        steps_per_iteration=2_048_000,
+        num_segments=20,
+        updates_per_step=1 / 64,
+        batch_size=4096,
+        critic_layer_norm=True,
+        learning_rate=1e-3,
+        initial_temperature=0.1,
+        restart_temperature=True,
+        reference_size=131_072,
+        mixture_episodes=256,
+    ),
     "paper": dict(
         num_iterations=20,
         steps_per_iteration=150_000,
@@ -276,18 +296,26 @@ _LOCOMOTION = dict(
     reward_scale=8.0,
 )
 _CLASSIC = dict(episode_length=200)
-
-# What a preset does otherwise in some environment.
-_IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
-    ("quick", "ant"): dict(
+_ROBOTS: dict[str, dict[str, Any]] = {
+    "ant": dict(
         torque_limit=0.4,
         end_flipped=True,
         policy_inputs="heading",
         yaw_copies=1,
         **_LOCOMOTION,
     ),
-    ("quick", "walker2d"): _LOCOMOTION,
-    ("quick", "humanoid"): dict(policy_inputs="heading", **_LOCOMOTION),
+    "walker2d": _LOCOMOTION,
+    "humanoid": dict(policy_inputs="heading", **_LOCOMOTION),
+}
+
+# What a preset does otherwise in some environment.
+_IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
+    **{("quick", env): changes for env, changes in _ROBOTS.items()},
+    **{("gpu", env): dict(physics="fast", **changes) for env, changes in _ROBOTS.items()},
+    **{
+        ("gpu", env): dict(reference_size=32_768, reward_distance=0.1, **_CLASSIC)
+        for env in CLASSIC_ENVS
+    },
     **{("paper", env): dict(reference_size=8_192, **_CLASSIC) for env in CLASSIC_ENVS},
     **{
         ("quick", env): dict(
@@ -369,7 +397,16 @@ _POSITIVE = (
 )
 _AT_MOST_ONE = ("torque_limit", "discount", "soft_update_rate", "eta")
 _NOT_NEGATIVE = (
-    *("seed", "shaping", "episodic_weight", "yaw_copies", "discount", "target_entropy_scale"),
+    *(
+        "seed",
+        "plateau_segments",
+        "plateau_tolerance",
+        "shaping",
+        "episodic_weight",
+        "yaw_copies",
+        "discount",
+        "target_entropy_scale",
+    ),
 )
 
 
@@ -412,6 +449,11 @@ def _check_together(c: Config) -> None:
         (
             c.yaw_copies and c.env not in TURNING_ENVS,
             f"yaw-copies is {c.yaw_copies}, but {c.env} cannot be turned about the vertical.",
+        ),
+        (
+            2 * c.plateau_segments > c.num_segments,
+            f"plateau-segments is {c.plateau_segments}, but must be at most half of num-segments = "
+            f"{c.num_segments}.",
         ),
         (
             c.steps_per_iteration % group,

@@ -1,0 +1,151 @@
+"""Which regime takes Ant farthest? Preset `quick` with one thing changed at a time.
+
+Each run is `experiments.train` in a process of its own with its share of the cores; its row joins
+the file given by --out as soon as it ends, and a row that is there is not made again.
+"""
+
+import json
+import os
+import queue
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from benchmarks import common
+from maxent_jax import runs
+
+# What each regime changes of the preset.
+REGIMES: dict[str, dict[str, Any]] = {
+    "quick": {},
+    "one-step returns": {"return_steps": 1},
+    "five-step returns": {"return_steps": 5},
+    "eight-step returns": {"return_steps": 8},
+    "linear reward": {"reward": "linear"},
+    "log1p, c = 5 m": {"reward_distance": 5.0, "reward_scale": 2.0},
+    "log reward": {"reward": "log"},
+    "p log R": {"reward": "paper", "reward_scale": 1.0},
+    "potential in all features": {"shaping_space": "features"},
+    "invariant shaping": {"shaping_survives_death": False},
+    "no shaping": {"shaping": 0.0},
+    "full torque": {"torque_limit": 1.0},
+    "episodes go on upside down": {"end_flipped": False},
+    "full torque, upside down": {"torque_limit": 1.0, "end_flipped": False},
+    "plain state": {"policy_inputs": "state", "yaw_copies": 0},
+    "no yaw copies": {"yaw_copies": 0},
+    "three yaw copies": {"yaw_copies": 3},
+    "no layer norm": {"critic_layer_norm": False},
+    "temperature goes on": {"restart_temperature": False},
+    "rate 3e-4": {"learning_rate": 3e-4},
+    "batch 256": {"batch_size": 256},
+    "2 x 256": {"hidden_size": 256},
+    "64 envs, 0.25 updates a step": {"num_envs": 64, "updates_per_step": 0.25, "num_segments": 5},
+    "16 envs, 1 update a step": {"num_envs": 16, "updates_per_step": 1.0},
+    "episodes of 500": {"episode_length": 500},
+    "discount 0.98": {"discount": 0.98, "shaping": 50.0, "reward_scale": 16.0},
+    "episodic term 0.1": {"episodic_weight": 0.1},
+    "starts from the last": {"start": "last"},
+    "starts from scratch": {"start": "scratch"},
+    "a plateau ends an iteration": {"plateau_segments": 4},
+}
+KEPT = (
+    *("cumulative_coverage", "cumulative_entropy", "random_coverage", "mixture_coverage"),
+    *("mixture_entropy", "cumulative_off_grid_share", "flipped_share", "segments_trained"),
+    *("env_steps", "gradient_steps", "wall_seconds", "wall_train_total"),
+)
+
+
+def run(name: str, seed: int, base: dict[str, Any], cores: set[int]) -> dict[str, Any]:
+    """A row: what the run reached after each iteration."""
+    settings = base | REGIMES[name]
+    flags = [f"--preset={settings['preset']}", f"--seed={seed}"]
+    for field, value in settings.items():
+        flag = field.replace("_", "-")
+        if isinstance(value, bool):
+            flags.append(f"--{flag}" if value else f"--no-{flag}")
+        elif field != "preset":
+            flags += [f"--{flag}", str(value)]
+    with tempfile.TemporaryDirectory() as folder:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "experiments.train", *flags, "--out", folder],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        if hasattr(os, "sched_setaffinity"):  # before its threads start, which inherit it
+            os.sched_setaffinity(process.pid, cores)
+        _, errors = process.communicate()
+        if process.returncode != 0:
+            raise RuntimeError(f"{name}, seed {seed}: {errors}")
+        rows = runs.read_metrics(Path(folder))
+    columns = {key: [row[key] for row in rows] for key in KEPT if key in rows[-1]}
+    changes = REGIMES[name]
+    return {"benchmark": "learning", "regime": name, "changes": changes, "seed": seed} | columns
+
+
+def study(names, seeds, base, jobs: int, out: Path) -> Iterator[dict[str, Any]]:
+    """Rows as they end, `jobs` runs side by side; each is in the file before it is yielded."""
+    done = json.loads(out.read_text())["rows"] if out.exists() else []
+    missing = [
+        (name, seed)
+        for name in names
+        for seed in seeds
+        if not any((row["regime"], row["seed"]) == (name, seed) for row in done)
+    ]
+    available = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    shares: queue.Queue[set[int]] = queue.Queue()
+    for job in range(jobs):
+        shares.put(set(available[job::jobs]) or set(available))
+
+    def next_run(name, seed):
+        cores = shares.get()
+        try:
+            return run(name, seed, base, cores)
+        finally:
+            shares.put(cores)
+
+    with ThreadPoolExecutor(jobs) as pool:
+        for future in as_completed(pool.submit(next_run, *which) for which in missing):
+            row = future.result()
+            done.append(row)
+            runs.write_json(out, {"base": base, "rows": done})
+            yield row
+
+
+def summary(row: dict[str, Any]) -> dict[str, Any]:
+    """The row's last iteration, on one line."""
+    last = {name: values[-1] for name, values in row.items() if isinstance(values, list)}
+    return {"regime": row["regime"], "seed": row["seed"]} | last
+
+
+def main() -> None:
+    flags = common.parser(__doc__)
+    flags.add_argument("--regimes", nargs="*", choices=list(REGIMES), default=list(REGIMES))
+    flags.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
+    flags.add_argument("--iterations", type=int, help="of each run; the preset's where left out")
+    flags.add_argument("--jobs", type=int, default=common.CORES, help="runs side by side")
+    flags.add_argument("--out", type=Path, default=Path("results/learning.json"))
+    args = flags.parse_args()
+    common.print_versions()
+    base: dict[str, Any] = {"preset": "quick", "random_baseline": False}
+    if args.iterations:
+        base["num_iterations"] = args.iterations
+    if args.toy:
+        base = {"preset": "smoke", "env": "pendulum"}
+        args.regimes, args.seeds = ["linear reward"], [0]
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "toy.json" if args.toy else args.out
+        out.parent.mkdir(parents=True, exist_ok=True)
+        rows = []
+        for row in study(args.regimes, args.seeds, base, args.jobs, out):
+            common.progress(summary(row))
+            rows.append(row)
+    for row in rows:
+        common.emit(row)
+
+
+if __name__ == "__main__":
+    main()
