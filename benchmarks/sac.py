@@ -1,13 +1,17 @@
 """How many SAC updates a second, what share of the machine's matmul peak is that, and the peers?
 
 Updates run in one scan, each on a batch of its own of Ant's sizes. Peers run their own `train` on
-their own replay, from which they also draw the batches.
+their own replay, from which they also draw the batches. The whole loop steps Ant too, on C MuJoCo:
+ours is a segment of MaxEnt-V with the reward measured and paid, theirs is `learn`.
 """
 
 import functools
 import itertools
+import statistics
+import time
+import warnings
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import jax
@@ -15,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import common
+from maxent_jax import algorithm, runtime
 from maxent_jax.config import preset
 from maxent_jax.sac import agent, losses
 
@@ -24,6 +29,7 @@ NUM_SEEDS = (1, 2)
 NUM_HIDDEN_LAYERS = 2
 NUM_UPDATES = 200
 PEAK_SIZE = 2048
+LOOP_STEPS = 1280
 
 
 def peak_flops(size: int, repeats: int) -> float:
@@ -97,6 +103,22 @@ def ours(
     return num_seeds * num_updates / seconds, compile_seconds
 
 
+class Loop(NamedTuple):
+    """How a whole loop alternates."""
+
+    num_envs: int
+    updates_per_step: float
+
+
+# One environment as the peers are used by default, several at the same ratio, and quick's own.
+_QUICK = preset("quick")
+LOOPS = (
+    Loop(1, 1.0),
+    Loop(_QUICK.num_envs, 1.0),
+    Loop(_QUICK.num_envs, _QUICK.updates_per_step),
+)
+
+
 class Noise(gymnasium.Env):
     """Nothing but spaces of Ant's sizes, from which a peer makes its networks."""
 
@@ -125,6 +147,59 @@ def baselines(module, hidden_size: int, batch_size: int, num_updates: int, repea
         model.replay_buffer.add(observation, following, action, reward, done, [{}])
     run = lambda: model.train(gradient_steps=num_updates, batch_size=batch_size)
     return num_updates / common.median_seconds(run, repeats)
+
+
+def our_loop(hidden_size: int, batch_size: int, loop: Loop, steps: int, repeats: int) -> float:
+    """Env steps a second of training on Ant."""
+    config = preset(
+        "quick",
+        hidden_size=hidden_size,
+        batch_size=batch_size,
+        num_envs=loop.num_envs,
+        updates_per_step=loop.updates_per_step,
+        steps_per_iteration=steps,
+        num_segments=1,
+        replay_size=100_000,
+        random_baseline=False,
+    )
+    programs = algorithm.programs(config)
+    state, _ = programs.begin(algorithm.start(config))
+    seconds = []
+    for _ in range(1 + repeats):
+        started = time.perf_counter()
+        state, metrics = programs.train_segment(state)
+        jax.block_until_ready((state, metrics))
+        seconds.append(time.perf_counter() - started)
+    return steps / statistics.median(seconds[1:])
+
+
+def their_loop(
+    module, hidden_size: int, batch_size: int, loop: Loop, steps: int, repeats: int
+) -> float:
+    """Env steps a second of `learn` on Gymnasium's Ant, the same number of environments."""
+    from stable_baselines3.common.env_util import make_vec_env
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Gymnasium's, that v4 is out of date
+        envs = make_vec_env("Ant-v4", n_envs=loop.num_envs)
+    model = module.SAC(
+        "MlpPolicy",
+        envs,
+        batch_size=batch_size,
+        buffer_size=100_000,
+        learning_starts=loop.num_envs,
+        train_freq=1,
+        gradient_steps=round(loop.updates_per_step * loop.num_envs),
+        policy_kwargs={"net_arch": [hidden_size] * NUM_HIDDEN_LAYERS},
+        device="cpu",
+    )
+    model.learn(2 * steps)  # compiles, and fills the replay
+    seconds = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        model.learn(steps, reset_num_timesteps=False)
+        seconds.append(time.perf_counter() - started)
+    return steps / statistics.median(seconds)
 
 
 PEERS = (
@@ -167,15 +242,43 @@ def measure(
         yield row(peer.distribution, updates, layer_norm=False, seeds=1)
 
 
+def measure_loops(
+    size: tuple[int, int], loops, steps: int, peers, repeats: int
+) -> Iterator[dict[str, Any]]:
+    """Rows for one size; ratios are to ours in the same loop."""
+    hidden_size, batch_size = size
+    for loop in loops:
+        found = {"maxent_jax": our_loop(hidden_size, batch_size, loop, steps, repeats)}
+        found |= {
+            peer.distribution: their_loop(module, hidden_size, batch_size, loop, steps, repeats)
+            for peer, module in peers
+        }
+        for who, rate in found.items():
+            yield common.progress(
+                {
+                    "benchmark": "sac",
+                    "who": f"{who}, whole loop",
+                    "hidden_size": hidden_size,
+                    "batch_size": batch_size,
+                    **loop._asdict(),
+                    "env_steps_per_second": rate,
+                    "ours_over_this": found["maxent_jax"] / rate,
+                }
+            )
+
+
 def main() -> None:
     args = common.parser(__doc__).parse_args()
     common.print_versions(PEERS)
+    runtime.prepare(simulates_in_jax=False)
     sizes, num_updates = (((16, 8),), 4) if args.toy else (SIZES, NUM_UPDATES)
+    loops, steps = ((Loop(4, 0.25),), 8) if args.toy else (LOOPS, LOOP_STEPS)
     peak = peak_flops(256 if args.toy else PEAK_SIZE, args.repeats)
     rows = [common.progress({"benchmark": "sac", "who": "matmul", "gflop_per_second": peak / 1e9})]
     peers = common.importable(PEERS)
     for size in sizes:
         rows += measure(size, num_updates, peak, peers, args.repeats)
+        rows += measure_loops(size, loops, steps, peers, args.repeats)
     for row in rows:
         common.emit(row)
 

@@ -253,12 +253,16 @@ PRESETS: dict[str, dict[str, Any]] = {
         replay_size=2_000,
     ),
     "quick": dict(
+        num_envs=64,
+        steps_per_iteration=120_000,
+        updates_per_step=0.25,
         hidden_size=128,
         critic_layer_norm=True,
         learning_rate=1e-3,
+        return_steps=3,
         initial_temperature=0.1,
         restart_temperature=True,
-        replay_size=120_000,
+        replay_size=240_000,
     ),
     "gpu": dict(
         num_iterations=20,
@@ -269,6 +273,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         batch_size=4096,
         critic_layer_norm=True,
         learning_rate=1e-3,
+        return_steps=3,
         initial_temperature=0.1,
         restart_temperature=True,
         reference_size=131_072,
@@ -319,7 +324,7 @@ _IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
     **{("paper", env): dict(reference_size=8_192, **_CLASSIC) for env in CLASSIC_ENVS},
     **{
         ("quick", env): dict(
-            steps_per_iteration=9_600,
+            steps_per_iteration=19_200,
             reference_size=4_096,
             reward_distance=0.1,
             **_CLASSIC,

@@ -201,9 +201,10 @@ def _address(previous: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
 def _start_features(parts: Parts, items: Step, starts: jax.Array, rows: jax.Array) -> jax.Array:
     """[..., V, F] of the starts that the items in `rows` [...] left, if they left one."""
     _, _, start = _address(items.previous[rows])
-    if items.angle is None:
+    if items.angle is None and rows.size > starts.shape[0]:
         return parts.phi(starts)[start][..., None, :]
-    return _variants(parts, starts[start], items.angle[rows])
+    angle = None if items.angle is None else items.angle[rows]
+    return _variants(parts, starts[start], angle)
 
 
 def _variants(parts: Parts, state: jax.Array, angle: jax.Array | None) -> jax.Array:

@@ -48,7 +48,12 @@ def test_presets_are_valid_in_every_environment_and_survive_a_round_trip(name, e
         (dict(seed=2**31), "must not exceed 2"),
         (dict(mixture_episodes=2), "each of the 3 policies"),
         (dict(reference_size=801), "at most 800 states"),
-        (dict(num_envs=400, num_segments=1, replay_size=399), "adds 400"),
+        (dict(num_envs=400, num_segments=1, replay_size=1599), "four steps of all envs, 1600"),
+        (dict(replay_dtype="bfloat16"), "did you mean 'float16'"),
+        (dict(replay_dtype="float16", yaw_copies=1), "need states in float32"),
+        (dict(return_steps=0), "at least 1"),
+        (dict(plateau_segments=2), "at most half of num-segments = 2"),
+        (dict(plateau_tolerance=-0.1), "0 or more"),
     ],
 )
 def test_a_bad_value_is_refused_by_name(changes, words):

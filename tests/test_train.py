@@ -295,13 +295,46 @@ def test_evaluate_says_when_there_is_no_checkpoint(tmp_path):
     assert "no complete checkpoint" in call("experiments.evaluate", tmp_path, expect=2).stderr
 
 
-@pytest.mark.parametrize(
-    "module", ["knn", "envs", "physics", "sac", "seeds", "forward_velocity", "compile_time"]
-)
+TOY = ("knn", "envs", "physics", "sac", "seeds", "forward_velocity", "compile_time", "replay")
+
+
+@pytest.mark.parametrize("module", [*TOY, "learning"])
 def test_a_benchmark_ends_with_json_rows(module):
     printed = call(f"benchmarks.{module}", "--toy").stdout.splitlines()
     assert printed[0].startswith("# python")
     assert json.loads(printed[-1])["benchmark"] == module
+
+
+def test_a_gpu_session_runs_part_by_part_and_only_once(tmp_path):
+    folders = ("--out", tmp_path / "results", "--work", tmp_path / "work")
+    parts = ("--part", "envs", "train")  # the others are benchmarks that run above
+    first = call("benchmarks.gpu_session", "--toy", *parts, *folders).stdout
+    assert first.count("exit 0") == 4
+    ran = json.loads((tmp_path / "results" / "envs_ant.json").read_text())
+    assert ran["rows"][-1]["benchmark"] == "envs"
+    paths = np.load(tmp_path / "results" / "ant_states.npz")
+    assert paths["seed_1_states"].shape[:1] == paths["seed_1_policy"].shape == (3,)
+    assert (tmp_path / "results" / "ant_curves.png").stat().st_size > 0
+    assert call("benchmarks.gpu_session", "--toy", *parts, *folders).stdout == ""
+
+
+def test_an_iteration_ends_at_a_plateau(tmp_path):
+    config = preset(
+        "smoke",
+        env="pendulum",
+        num_segments=10,
+        num_iterations=1,
+        plateau_segments=1,
+        plateau_tolerance=1.0,  # any segment after the lowest
+    )
+    driver.train(config, tmp_path, time.perf_counter())
+    (row,) = runs.read_metrics(tmp_path)
+    taken = row["segments_trained"]
+    assert row["converged"] and 2 <= taken < 10
+    assert row["env_steps"] == 40 * taken
+    rewards = row["segment_reward"]
+    assert None not in rewards[:taken] and rewards[taken:] == [None] * (10 - taken)
+    assert maxent_jax.load_run(tmp_path).metrics["segment_reward"].shape == (1, 10)
 
 
 def test_the_feature_table_is_what_its_script_measures():

@@ -1,0 +1,114 @@
+"""How large is the replay, and what does it cost to insert once it is full, or to draw?
+
+The usual buffer keeps both observations of each transition: twice the memory.
+"""
+
+import functools
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from benchmarks import common
+from maxent_jax import experience, parts
+from maxent_jax.config import MUJOCO_ENVS, Config, preset
+from maxent_jax.experience import Reference
+from maxent_jax.sac import replay
+from maxent_jax.types import Transition
+
+CAPACITY = 1_000_000
+NUM_INSERTS = 100
+
+
+def num_bytes(tree: Any) -> int:
+    """Of all its arrays."""
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+
+def both_observations(config: Config) -> int:
+    """Bytes of a float32 buffer of observation, action, reward, next observation and done flag."""
+    sac = parts.make(config).sac
+    return 4 * config.replay_size * (2 * sac.observation_size + sac.action_size + 2)
+
+
+def insert_seconds(config: Config, full: bool, repeats: int) -> float:
+    """Of one step of all envs, in a donated scan; the search of its distances included."""
+    p = parts.make(config)
+    n, sac = config.num_envs, p.sac
+    state = jnp.ones((n, sac.observation_size))
+    flags = jnp.zeros((3, n), bool)
+    transition = Transition(
+        state, jnp.zeros((n, sac.action_size)), state, flags[0], flags[1], ~flags[2]
+    )
+    reference = Reference(
+        jax.random.normal(jax.random.key(0), (config.reference_size, len(p.phi.names))),
+        jnp.asarray(config.reference_size),
+    )
+
+    def step(carry, key):
+        ring, place = carry
+        ring, rows = experience.add(p, reference, ring, transition, place, jnp.zeros(n), key)
+        return (ring, rows), None
+
+    @functools.partial(jax.jit, donate_argnums=0)
+    def inserts(carry):
+        return jax.lax.scan(step, carry, jax.random.split(jax.random.key(1), NUM_INSERTS))[0]
+
+    ring = experience.init(p)
+    if full:
+        ring = ring._replace(size=jnp.asarray(config.replay_size, jnp.int32))
+    carry = [ring, jnp.full(n, -1, jnp.int32)]
+
+    def call():
+        carry[:] = inserts(tuple(carry))
+        return carry
+
+    return common.median_seconds(call, repeats) / NUM_INSERTS
+
+
+def sample_seconds(config: Config, repeats: int) -> float:
+    """Of drawing one batch from a full replay."""
+    p = parts.make(config)
+    starts = jnp.ones((config.num_starts, p.sac.observation_size))
+    ring = experience.init(p)
+    ring = ring._replace(size=jnp.asarray(config.replay_size, jnp.int32))
+    sample = jax.jit(functools.partial(experience.sample, p, shape=(config.batch_size,)))
+    return common.median_seconds(lambda: sample(ring, starts, key=jax.random.key(0)), repeats)
+
+
+def measure(env: str, capacity: int, repeats: int) -> Iterator[dict[str, Any]]:
+    """A row for each width of the states."""
+    for dtype in ("float32", "float16"):
+        settings = {"replay_size": capacity, "replay_dtype": dtype, "yaw_copies": 0}
+        config = preset("quick", env=env, **settings)
+        ring = jax.eval_shape(lambda c=config: experience.init(parts.make(c)))
+        assert replay.capacity_of(ring) == capacity
+        size = num_bytes(ring)
+        empty, full = (insert_seconds(config, full, repeats) for full in (False, True))
+        yield common.progress(
+            {
+                "benchmark": "replay",
+                "env": env,
+                "states": dtype,
+                "transitions": capacity,
+                "gigabytes": size / 1e9,
+                "over_both_observations": size / both_observations(config),
+                "insert_microseconds": 1e6 * full,
+                "insert_full_over_empty": full / empty,
+                "sample_microseconds": 1e6 * sample_seconds(config, repeats),
+            }
+        )
+
+
+def main() -> None:
+    args = common.parser(__doc__).parse_args()
+    common.print_versions()
+    envs, capacity = (("ant",), 1_000) if args.toy else (MUJOCO_ENVS, CAPACITY)
+    rows = [row for env in envs for row in measure(env, capacity, args.repeats)]
+    for row in rows:
+        common.emit(row)
+
+
+if __name__ == "__main__":
+    main()
