@@ -63,6 +63,16 @@ REGIMES: dict[str, dict[str, Any]] = {
     "episodic term 0.1": {"episodic_weight": 0.1},
     "starts from the last": {"start": "last"},
     "starts from scratch": {"start": "scratch"},
+    "as in the paper": {
+        "torque_limit": 1.0,
+        "end_flipped": False,
+        "reward": "paper",
+        "reward_scale": 1.0,
+        "shaping": 0.0,
+        "policy_inputs": "state",
+        "yaw_copies": 0,
+        "return_steps": 1,
+    },
     "a plateau ends an iteration": {"plateau_segments": 4},
 }
 KEPT = (
