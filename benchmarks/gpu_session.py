@@ -7,7 +7,10 @@ failed or ran out of time, and is left out when called again. No network is need
 
 import argparse
 import json
+import multiprocessing
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -38,7 +41,7 @@ def benchmark(name: str, module: str, *flags: str) -> Command:
 
 def train(name: str, *flags: str) -> Command:
     """A run of MaxEnt-V, whose directory lies among the session's other large files."""
-    command = ("experiments.train", "--out", f"{{work}}/{name}")
+    command = ("experiments.train", "--resume", "--out", f"{{work}}/{name}")
     toy = ("--preset", "smoke", "--env", "pendulum", "--num-seeds", "2")
     return Command(name, (*command, *flags), (*command, *toy))
 
@@ -71,12 +74,16 @@ def run_command(command: Command, work: Path, toy: bool, seconds: float) -> dict
     log = work / f"{command.name}.log"
     with open(log, "w") as errors:
         process = subprocess.Popen(
-            [sys.executable, "-m", *arguments], stdout=subprocess.PIPE, stderr=errors, text=True
+            [sys.executable, "-m", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            start_new_session=True,  # so that its children end with it
         )
         try:
             printed, _ = process.communicate(timeout=max(seconds, 1))
         except subprocess.TimeoutExpired:
-            process.kill()
+            os.killpg(process.pid, signal.SIGKILL)
             printed, _ = process.communicate()
     lines = printed.splitlines()
     return {
@@ -116,7 +123,12 @@ def run_part(name: str, out: Path, work: Path, toy: bool) -> bool:
             continue
         found = run_command(command, work, toy, deadline - time.perf_counter())
         if (work / command.name / runs.METRICS).exists() and found["exit_code"] == 0:
-            collect(work / command.name, out, episodes_per_policy=1 if toy else 3)
+            # In a process of its own: this one must not hold the accelerator's memory.
+            arguments = (work / command.name, out, 1 if toy else 3)
+            alone = multiprocessing.get_context("spawn").Process(target=collect, args=arguments)
+            alone.start()
+            alone.join()
+            found["exit_code"] = alone.exitcode
         runs.write_json(path, found)
         print(
             f"{command.name}: exit {found['exit_code']} after {found['seconds']:.0f} s", flush=True

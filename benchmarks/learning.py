@@ -84,7 +84,7 @@ KEPT = (
 
 def run(name: str, seed: int, base: dict[str, Any], cores: set[int]) -> dict[str, Any]:
     """A row: what the run reached after each iteration."""
-    settings = base | REGIMES[name]
+    settings = REGIMES[name] | base
     flags = [f"--preset={settings['preset']}", f"--seed={seed}"]
     for field, value in settings.items():
         flag = field.replace("_", "-")
@@ -112,7 +112,11 @@ def run(name: str, seed: int, base: dict[str, Any], cores: set[int]) -> dict[str
 
 def study(names, seeds, base, jobs: int, out: Path) -> Iterator[dict[str, Any]]:
     """Rows as they end, `jobs` runs side by side; each is in the file before it is yielded."""
-    done = json.loads(out.read_text())["rows"] if out.exists() else []
+    kept = json.loads(out.read_text()) if out.exists() else {"base": base, "rows": []}
+    done = kept["rows"]
+    stale = [row["regime"] for row in done if row["changes"] != REGIMES.get(row["regime"])]
+    if kept["base"] != base or stale:
+        raise ValueError(f"{out} holds rows of other settings: choose another --out")
     missing = [
         (name, seed)
         for name in names
@@ -131,12 +135,19 @@ def study(names, seeds, base, jobs: int, out: Path) -> Iterator[dict[str, Any]]:
         finally:
             shares.put(cores)
 
+    failed = 0
     with ThreadPoolExecutor(jobs) as pool:
         for future in as_completed(pool.submit(next_run, *which) for which in missing):
+            if future.exception() is not None:
+                print(f"failed: {future.exception()}", file=sys.stderr)
+                failed += 1
+                continue
             row = future.result()
             done.append(row)
             runs.write_json(out, {"base": base, "rows": done})
             yield row
+    if failed:
+        raise RuntimeError(f"{failed} runs failed; the others are in {out}")
 
 
 def summary(row: dict[str, Any]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from maxent_jax import experience, parts
 from maxent_jax.config import MUJOCO_ENVS, Config, preset
 from maxent_jax.experience import Reference
 from maxent_jax.sac import replay
+from maxent_jax.sac.replay import Replay
 from maxent_jax.types import Transition
 
 CAPACITY = 1_000_000
@@ -30,6 +31,20 @@ def both_observations(config: Config) -> int:
     """Bytes of a float32 buffer of observation, action, reward, next observation and done flag."""
     sac = parts.make(config).sac
     return 4 * config.replay_size * (2 * sac.observation_size + sac.action_size + 2)
+
+
+def ring_of(config: Config, full: bool) -> Replay:
+    """Empty, or as if every environment had gone on for as long as the ring is, without an end."""
+    ring = experience.init(parts.make(config))
+    if not full:
+        return ring
+    rows = jnp.arange(config.replay_size, dtype=jnp.int32)
+    pointers = {
+        "previous": (rows - config.num_envs) % config.replay_size,
+        "following": (rows + config.num_envs) % config.replay_size,
+    }
+    size = jnp.asarray(config.replay_size, jnp.int32)
+    return ring._replace(items=ring.items._replace(**pointers), size=size)
 
 
 def insert_seconds(config: Config, full: bool, repeats: int) -> float:
@@ -55,10 +70,8 @@ def insert_seconds(config: Config, full: bool, repeats: int) -> float:
     def inserts(carry):
         return jax.lax.scan(step, carry, jax.random.split(jax.random.key(1), NUM_INSERTS))[0]
 
-    ring = experience.init(p)
-    if full:
-        ring = ring._replace(size=jnp.asarray(config.replay_size, jnp.int32))
-    carry = [ring, jnp.full(n, -1, jnp.int32)]
+    place = (jnp.arange(n, dtype=jnp.int32) - n) % config.replay_size if full else jnp.full(n, -1)
+    carry = [ring_of(config, full), place]
 
     def call():
         carry[:] = inserts(tuple(carry))
@@ -71,8 +84,7 @@ def sample_seconds(config: Config, repeats: int) -> float:
     """Of drawing one batch from a full replay."""
     p = parts.make(config)
     starts = jnp.ones((config.num_starts, p.sac.observation_size))
-    ring = experience.init(p)
-    ring = ring._replace(size=jnp.asarray(config.replay_size, jnp.int32))
+    ring = ring_of(config, full=True)
     sample = jax.jit(functools.partial(experience.sample, p, shape=(config.batch_size,)))
     return common.median_seconds(lambda: sample(ring, starts, key=jax.random.key(0)), repeats)
 

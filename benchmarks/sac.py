@@ -18,8 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import common
-from maxent_jax import algorithm, runtime
+from benchmarks import common, seeds
+from maxent_jax import runtime
 from maxent_jax.config import preset
 from maxent_jax.sac import agent, losses
 
@@ -162,15 +162,7 @@ def our_loop(hidden_size: int, batch_size: int, loop: Loop, steps: int, repeats:
         replay_size=100_000,
         random_baseline=False,
     )
-    programs = algorithm.programs(config)
-    state, _ = programs.begin(algorithm.start(config))
-    seconds = []
-    for _ in range(1 + repeats):
-        started = time.perf_counter()
-        state, metrics = programs.train_segment(state)
-        jax.block_until_ready((state, metrics))
-        seconds.append(time.perf_counter() - started)
-    return steps / statistics.median(seconds[1:])
+    return steps / seeds.seconds_per_segment(config, repeats)
 
 
 def their_loop(

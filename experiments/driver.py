@@ -35,25 +35,29 @@ def train(config: Config, directory: Path, process_started: float, num_devices: 
     placed = _placement(config, num_devices)
     completed = checkpoint.latest_step(directory) or 0
     if completed == config.num_iterations:
-        if not plotting.all_saved(directory):  # killed after its last checkpoint
-            _draw(directory)
-        print(f"{directory} is complete: nothing to train.")
+        drawn = plotting.all_saved(directory)
+        hosts.leave()
+        if hosts.is_first():
+            if not drawn:  # killed after its last checkpoint
+                _draw(directory)
+            print(f"{directory} is complete: nothing to train.")
         return
     if completed:
         state = checkpoint.restore(directory, config, placed)
     else:
         state = algorithm.start(config) if placed is None else devices.start(config, placed)
-        hosts.first_alone(lambda: _write_config(config, directory))
+        hosts.first_alone(lambda: _write_config(config, directory), "config")
     rows = runs.read_metrics(directory)[:completed]
-    hosts.first_alone(lambda: runs.truncate_metrics(directory, completed))
+    hosts.first_alone(lambda: runs.truncate_metrics(directory, completed), "metrics")
     clock = _Clock(process_started, rows[-1] if rows else {})
-    programs = algorithm.programs(config, placed)
+    programs = algorithm.programs(config) if placed is None else devices.programs(config, placed)
     with _Bar(config, completed) as bar:
         for iteration in range(completed, config.num_iterations):
             state, row = _iterate(config, programs, state, clock, bar)
             if hosts.is_first():
                 runs.append_metrics(directory, row)
             checkpoint.save(directory, state, iteration + 1)
+    hosts.leave()
     if hosts.is_first():
         _draw(directory)
         _summarise(directory, rows=runs.read_metrics(directory))
@@ -213,6 +217,8 @@ def _draw(directory: Path) -> None:
     os.environ["JAX_PLATFORMS"] = "cpu"  # of the child: the accelerator's memory is taken
     alone.start()
     alone.join()
+    if alone.exitcode != 0:
+        raise RuntimeError(f"drawing the figures of {directory} failed; --resume tries again.")
 
 
 def draw(directory: Path) -> None:

@@ -1,4 +1,4 @@
-"""Several processes that train one run: joining them, and what only the first of them does."""
+"""Several processes that train one run: how they meet, wait for each other, and part."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 import jax
 from jax.experimental import multihost_utils
 
-HEARTBEAT_TIMEOUT = 20  # seconds until the others know that a process is gone, and end too
+TIMEOUT = 20  # seconds until the others know that a process is gone, and end too
 
 
 def join(coordinator: str, num_processes: int, process_id: int) -> None:
@@ -22,7 +22,15 @@ def join(coordinator: str, num_processes: int, process_id: int) -> None:
             "num_processes": num_processes,
             "process_id": process_id,
         }
-    jax.distributed.initialize(**where, heartbeat_timeout_seconds=HEARTBEAT_TIMEOUT)
+    jax.distributed.initialize(
+        **where, heartbeat_timeout_seconds=TIMEOUT, shutdown_timeout_seconds=TIMEOUT
+    )
+
+
+def leave() -> None:
+    """Waits until all have come so far; afterwards none waits for another."""
+    if jax.process_count() > 1:
+        jax.distributed.shutdown()
 
 
 def is_first() -> bool:
@@ -30,9 +38,14 @@ def is_first() -> bool:
     return jax.process_index() == 0
 
 
-def first_alone(act: Callable[[], Any]) -> None:
+def wait_for_all(where: str) -> None:
+    """Goes on once every process has come to the place of that name."""
+    if jax.process_count() > 1:
+        multihost_utils.sync_global_devices(where)
+
+
+def first_alone(act: Callable[[], Any], where: str) -> None:
     """The first process acts while the others wait."""
     if is_first():
         act()
-    if jax.process_count() > 1:
-        multihost_utils.sync_global_devices("first_alone")
+    wait_for_all(where)

@@ -110,6 +110,10 @@ def _check_hosts(arguments: Arguments) -> None:
             f"{processes}.",
         ),
         (
+            coordinator == "auto" and (processes, arguments.process_id) != (1, 0),
+            "num-processes and process-id cannot be chosen with --coordinator auto.",
+        ),
+        (
             coordinator and arguments.devices > 1,
             "devices cannot be chosen with --coordinator: all devices of all processes take part.",
         ),
@@ -125,9 +129,12 @@ def main(argv: Sequence[str]) -> None:
     num_devices = arguments.devices
     if arguments.coordinator:
         from experiments import hosts  # loads jax
+        from maxent_jax import runtime
 
+        runtime.prepare(arguments.config.simulates_in_jax)  # before the first computation
         hosts.join(arguments.coordinator, arguments.num_processes, arguments.process_id)
-        hosts.first_alone(lambda: claim_directory(arguments))
+        claim_directory(arguments)  # by all, so that all end where it is taken
+        hosts.wait_for_all("directory")
         num_devices = 0
     else:
         claim_directory(arguments)

@@ -12,11 +12,10 @@ one program.
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.sharding import NamedSharding, PartitionSpec
 
 from maxent_jax import experience, methods, mixture, occupancy, parts, training
 from maxent_jax.config import Config
@@ -161,40 +160,29 @@ def run(config: Config, state: State, num_iterations: int) -> tuple[State, Metri
 
 
 class Programs(NamedTuple):
-    """The three compiled functions of an iteration, State -> State and Metrics; state donated."""
+    """The three functions of an iteration, State -> State and Metrics; compiled, state donated."""
 
     begin: Callable[[State], tuple[State, Metrics]]
     train_segment: Callable[[State], tuple[State, Metrics]]
     end: Callable[[State], tuple[State, Metrics]]
 
 
-def programs(config: Config, placed: State | None = None) -> Programs:
-    """What a driver calls to log and save in between; compiled once for each program.
-
-    Args:
-      placed: the sharding of each leaf of the state, see devices.placement; one device if left out.
-    """
-    program, seed_axis = config.program(), config.num_seeds > 1
-    if placed is None:
-        return _on_one_device(program, seed_axis)
-    (mesh,) = {leaf.mesh for leaf in jax.tree.leaves(placed)}
-    metrics = NamedSharding(mesh, PartitionSpec())
-    return _programs(program, seed_axis, in_shardings=(placed,), out_shardings=(placed, metrics))
+def programs(config: Config) -> Programs:
+    """What a driver calls to log and save in between; compiled once for each program."""
+    return _programs(config.program(), config.num_seeds > 1)
 
 
 @functools.lru_cache(maxsize=8)
-def _on_one_device(config: Config, seed_axis: bool) -> Programs:
-    return _programs(config, seed_axis)
+def _programs(config: Config, seed_axis: bool) -> Programs:
+    return Programs(*(jax.jit(f, donate_argnums=0) for f in functions(config, seed_axis)))
 
 
-def _programs(config: Config, seed_axis: bool, **shardings: Any) -> Programs:
-    def compiled(f):
-        f = functools.partial(f, config)
-        if seed_axis:
-            f = jax.vmap(f, in_axes=(SEED_AXES,), out_axes=(SEED_AXES, 0))
-        return jax.jit(f, donate_argnums=0, **shardings)
-
-    return Programs(compiled(begin), compiled(train_segment), compiled(end))
+def functions(config: Config, seed_axis: bool) -> Programs:
+    """The three functions of an iteration, not compiled; with an axis of seeds if asked."""
+    parts_of_it = (functools.partial(f, config) for f in (begin, train_segment, end))
+    if not seed_axis:
+        return Programs(*parts_of_it)
+    return Programs(*(jax.vmap(f, (SEED_AXES,), (SEED_AXES, 0)) for f in parts_of_it))
 
 
 def reduce_metrics(metrics: Metrics) -> Metrics:

@@ -9,9 +9,10 @@ def has_plateaued(rewards: Sequence[float], patience: int, tolerance: float) -> 
     """Whether the reward of the last segments has stopped rising.
 
     It has when, since its lowest segment, the mean of the last `patience` segments lies above that
-    of the `patience` before them by less than `tolerance` of all that the reward rose. A start that
-    first unlearns what it knew, or a policy that has learned nothing yet, is at its lowest: there
-    is no plateau. Adding a constant to the reward, or scaling it, changes nothing.
+    of the `patience` before them by at most `tolerance` of all that the reward rose. A reward that
+    falls, as where a policy first unlearns what it knew, is at its lowest: that is no plateau. One
+    that has not moved yet is one, so patience must outlast the wait. Adding a constant to the
+    reward, or scaling it, changes nothing.
 
     Args:
       rewards: mean unshaped r_t of each segment so far, in order.

@@ -11,7 +11,7 @@ from typing import Any
 
 from maxent_jax.config import Config, ConfigError
 
-SCHEMA = 1
+SCHEMA = 2  # of the directory, checkpoints included
 CONFIG, METRICS, FIGURES = "config.json", "metrics.jsonl", "figures"
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint")
 

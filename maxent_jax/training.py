@@ -112,9 +112,10 @@ def step(parts: Parts, method: Method, learner: Learner, key: jax.Array) -> tupl
     if parts.torso is not None:
         flipped = parts.torso.flipped(transition.next_observation)
         metrics["flipped_share"] = jnp.mean(flipped.astype(jnp.float32))
-    reached = ring.items.distances.reached.at[rows, 0].get(mode="fill", fill_value=0.0)
+    reached = ring.items.distances.reached.at[rows, 0].get(mode="fill", fill_value=1.0)
+    num_valid = jnp.maximum(jnp.sum(transition.valid), 1)
     metrics |= {
-        "step_reward": jnp.mean(unshaped_reward(parts, reached)),
+        "step_reward": jnp.sum(unshaped_reward(parts, reached) * transition.valid) / num_valid,
         "num_deaths": jnp.sum(transition.terminated, dtype=jnp.int32),
         "num_time_limits": jnp.sum(transition.truncated, dtype=jnp.int32),
         "num_invalid": jnp.sum(~everyone.valid, dtype=jnp.int32),

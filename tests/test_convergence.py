@@ -49,5 +49,10 @@ def test_patience_zero_never_ends():
     assert ends_at(np.ones(60), patience=0) is None
 
 
+@pytest.mark.parametrize("tolerance", [0.0, 0.05])
+def test_what_never_moves_ends_as_soon_as_it_may(tolerance):
+    assert ends_at(np.ones(60), tolerance=tolerance) == 8
+
+
 def test_too_few_segments_say_nothing():
     assert not has_plateaued([0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0], 4, 0.05)

@@ -21,8 +21,10 @@ from maxent_jax.devices import make_mesh
 ROOT = Path(__file__).parent.parent
 SMOKE = ("--preset", "smoke", "--env", "pendulum", "--num-iterations", "4")
 
-# 5 steps of 16 envs with an update each, as several programs round apart.
+# 5 steps of 16 envs with an update each, in episodes of 10 steps: several programs round apart, and
+# contacts amplify it.
 ON_EIGHT_DEVICES = """
+import re
 import sys
 from pathlib import Path
 
@@ -36,7 +38,7 @@ runtime.prepare(simulates_in_jax=False)
 env, num_seeds, directory = sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])
 config = preset(
     "smoke", env=env, num_seeds=num_seeds, num_envs=16, steps_per_iteration=80,
-    updates_per_step=1 / 16, num_segments=1, episode_length=50, num_iterations=1,
+    updates_per_step=1 / 16, num_segments=1, episode_length=10, num_iterations=1,
     reference_size=64, shaping=1.0,
 )
 mesh = devices.make_mesh(config, jax.devices())
@@ -55,7 +57,7 @@ def compare(a, b):
         else:
             np.testing.assert_array_equal(x, y)
 
-programs = algorithm.programs(config), algorithm.programs(config, placed)
+programs = algorithm.programs(config), devices.programs(config, placed)
 for on_one, on_many in zip(*programs, strict=True):
     one, metrics_one = on_one(one)
     many, metrics_many = on_many(many)
@@ -65,12 +67,21 @@ for on_one, on_many in zip(*programs, strict=True):
 state = many.learner.replay.items.state
 part = state.addressable_shards[0].data.shape
 print("part of the replay", state.size // np.prod(part), "of", dict(mesh.shape))
-capacity = config.replay_size
+# No exchange has the replay's rows, all of them or a device's part.
+rows = {config.replay_size, config.replay_size // mesh.shape["envs"]}
 program = programs[1].train_segment.lower(many).compile().as_text()
-for line in program.splitlines():  # no exchange has the replay's rows, whole or a device's part
-    if any(f" {kind}" in line for kind in ("all-gather", "all-to-all", "collective-permute")):
-        assert f"{capacity}," not in line.split("(")[0], line
-        assert f"{capacity // mesh.shape['envs']}," not in line.split("(")[0], line
+kinds = "all-gather|all-to-all|all-reduce|collective-permute"
+exchanges = [x for x in program.splitlines() if re.search(f" ({kinds})(-start)?[(]", x)]
+for line in exchanges:
+    result = re.split(f" ({kinds})(-start)?[(]", line)[0]
+    shapes = re.findall(r"[[]([0-9,]+)[]]", result)
+    dims = {int(n) for shape in shapes for n in shape.split(",")}
+    assert not dims & rows, line
+assert exchanges
+# What C++ computes is that of a device's own seeds.
+calls = [x for x in program.splitlines() if 'custom_call_target="maxent_' in x]
+for line in calls if num_seeds > 1 else ():
+    assert not re.search(rf"[[]{num_seeds},", line.split("custom-call")[0]), line
 
 checkpoint.save(directory, many, 1)
 compare(one, checkpoint.restore(directory, config))
@@ -81,7 +92,7 @@ print("equal")
 
 @pytest.mark.parametrize(
     ("env", "num_seeds", "across"),
-    [("ant", 1, {"seeds": 1, "envs": 8}), ("pendulum", 4, {"seeds": 4, "envs": 2})],
+    [("ant", 1, {"seeds": 1, "envs": 8}), ("ant", 4, {"seeds": 4, "envs": 2})],
 )
 def test_eight_devices_do_what_one_does(tmp_path, env, num_seeds, across):
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"

@@ -18,10 +18,9 @@ STARTS = 5
 
 def make(**changes):
     """Ant with a small ring; the environment itself is not stepped."""
-    return parts.make(
-        preset("quick", num_envs=NUM_ENVS, replay_size=CAPACITY, batch_size=4, updates_per_step=1.0,
-               steps_per_iteration=NUM_ENVS * 15, **changes)
-    )  # fmt: skip
+    sizes = dict(num_envs=NUM_ENVS, replay_size=CAPACITY, batch_size=4)
+    budget = dict(updates_per_step=1.0, steps_per_iteration=NUM_ENVS * 15)
+    return parts.make(preset("quick", **{**sizes, **budget, "return_steps": 1, **changes}))
 
 
 def states(rng, num):

@@ -266,7 +266,9 @@ def test_resume_with_other_settings_names_them(finished):
         lambda d: (d / "config.json").unlink(),
         lambda d: (d / "config.json").write_text("{"),
         lambda d: (d / "config.json").write_text('{"schema": 99, "config": {}}'),
-        lambda d: (d / "config.json").write_text('{"schema": 1, "config": {"no_such": 1}}'),
+        lambda d: (d / "config.json").write_text(
+            json.dumps({"schema": runs.SCHEMA, "config": {"no_such": 1}})
+        ),
     ],
 )
 def test_evaluate_refuses_a_directory_that_is_no_run(tmp_path, damage):

@@ -11,9 +11,9 @@ class Batch(NamedTuple):
 
     observation: jax.Array  # [B, D]
     action: jax.Array  # [B, A], in [-1, 1]
-    reward: jax.Array  # [B]
+    reward: jax.Array  # [B], or the discounted sum of n
     next_observation: jax.Array  # [B, D]
-    discount: jax.Array  # [B] 0 at a terminal state, else 1; a time limit is not terminal
+    discount: jax.Array  # [B] 0 at a terminal state, else γ^(n-1); a time limit is not terminal
 
 
 def sample_action(mean: jax.Array, log_std: jax.Array, key: jax.Array):
@@ -32,7 +32,10 @@ def critic_loss(values: jax.Array, target: jax.Array) -> jax.Array:
 
 
 def bellman_target(batch: Batch, next_value: jax.Array, discount: float) -> jax.Array:
-    """r + γ V(s'), V = min Q - α log π, and no V beyond a terminal state (Eq. 2 and 3)."""
+    """r + γ V(s'), V = min Q - α log π, and no V beyond a terminal state (Eq. 2 and 3).
+
+    With n steps, r is their discounted sum, s' the last state, and the discount γ^(n-1) more.
+    """
     return batch.reward + discount * batch.discount * next_value
 
 
