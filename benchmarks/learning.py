@@ -15,6 +15,10 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+
 from benchmarks import common
 from maxent_jax import runs
 
@@ -150,6 +154,31 @@ def study(names, seeds, base, jobs: int, out: Path) -> Iterator[dict[str, Any]]:
         raise RuntimeError(f"{failed} runs failed; the others are in {out}")
 
 
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Cells after the last iteration, a dot for each seed, best regime on top; and their curves."""
+    regimes = {row["regime"] for row in rows}
+    of_regime = {name: [r for r in rows if r["regime"] == name] for name in regimes}
+    ranked = sorted(
+        regimes, key=lambda name: np.mean([r["cumulative_coverage"][-1] for r in of_regime[name]])
+    )
+    figure = Figure(figsize=(11, 1.2 + 0.3 * max(len(ranked), 6)), layout="constrained")
+    dots, curves = figure.subplots(1, 2, width_ratios=(1, 1))
+    colors = colormaps["viridis"](np.linspace(0.05, 0.9, len(ranked)))
+    for place, (name, color) in enumerate(zip(ranked, colors, strict=True)):
+        for row in of_regime[name]:
+            cells = row["cumulative_coverage"]
+            dots.plot(cells[-1], place, "o", color=color)
+            curves.plot(np.array(row["gradient_steps"]) / 1000, cells, "-o", color=color, ms=3)
+    dots.set_yticks(range(len(ranked)), ranked)
+    dots.set_xlabel("cells visited in training, of 10,000")
+    curves.set_xlabel("thousand gradient steps")
+    for axes in (dots, curves):
+        axes.grid(alpha=0.25)
+    dots.set_xlim(left=0)
+    curves.set_ylim(bottom=0)
+    figure.savefig(path, dpi=110)
+
+
 def summary(row: dict[str, Any]) -> dict[str, Any]:
     """The row's last iteration, on one line."""
     last = {name: values[-1] for name, values in row.items() if isinstance(values, list)}
@@ -178,6 +207,8 @@ def main() -> None:
         for row in study(args.regimes, args.seeds, base, args.jobs, out):
             common.progress(summary(row))
             rows.append(row)
+        every = json.loads(out.read_text())["rows"]
+        draw(every, out.with_suffix(".png"))
     for row in rows:
         common.emit(row)
 

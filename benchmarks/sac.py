@@ -29,7 +29,7 @@ NUM_SEEDS = (1, 2)
 NUM_HIDDEN_LAYERS = 2
 NUM_UPDATES = 200
 PEAK_SIZE = 2048
-LOOP_STEPS = 1280
+LOOP_STEPS = 640
 
 
 def peak_flops(size: int, repeats: int) -> float:
