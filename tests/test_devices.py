@@ -92,7 +92,7 @@ print("equal")
 
 @pytest.mark.parametrize(
     ("env", "num_seeds", "across"),
-    [("ant", 1, {"seeds": 1, "envs": 8}), ("ant", 4, {"seeds": 4, "envs": 2})],
+    [("ant", 1, {"seeds": 1, "envs": 8}), ("pendulum", 4, {"seeds": 4, "envs": 2})],
 )
 def test_eight_devices_do_what_one_does(tmp_path, env, num_seeds, across):
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
