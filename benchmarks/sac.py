@@ -161,6 +161,10 @@ def our_loop(hidden_size: int, batch_size: int, loop: Loop, steps: int, repeats:
         num_segments=1,
         replay_size=100_000,
         random_baseline=False,
+        # the peers' networks and targets
+        critic_layer_norm=False,
+        return_steps=1,
+        yaw_copies=0,
     )
     return steps / seeds.seconds_per_segment(config, repeats)
 
