@@ -17,16 +17,8 @@ ORDER = [
     *("envs.ant", "envs.walker2d", "envs.humanoid", "envs.pendulum", "envs.mountain_car"),
     *("envs", "envs.base", "rollout", "features"),
     *("rewards", "sac.networks", "sac.replay", "sac.losses", "sac.agent", "mixture", "methods"),
-    *(
-        "parts",
-        "occupancy",
-        "experience",
-        "training",
-        "algorithm",
-        "checkpoint",
-        "analysis",
-        "plotting",
-    ),
+    *("parts", "occupancy", "experience", "training", "algorithm"),
+    *("devices", "checkpoint", "analysis", "plotting"),
 ]
 
 
