@@ -88,13 +88,12 @@ KEPT = (
 
 def run(name: str, seed: int, base: dict[str, Any], cores: set[int]) -> dict[str, Any]:
     """A row: what the run reached after each iteration."""
-    settings = REGIMES[name] | base
-    flags = [f"--preset={settings['preset']}", f"--seed={seed}"]
-    for field, value in settings.items():
+    flags: list[str] = []
+    for field, value in (REGIMES[name] | base | {"seed": seed}).items():
         flag = field.replace("_", "-")
         if isinstance(value, bool):
             flags.append(f"--{flag}" if value else f"--no-{flag}")
-        elif field != "preset":
+        else:
             flags += [f"--{flag}", str(value)]
     with tempfile.TemporaryDirectory() as folder:
         process = subprocess.Popen(

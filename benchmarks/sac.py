@@ -7,8 +7,6 @@ ours is a segment of MaxEnt-V with the reward measured and paid, theirs is `lear
 
 import functools
 import itertools
-import statistics
-import time
 import warnings
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -189,13 +187,9 @@ def their_loop(
         policy_kwargs={"net_arch": [hidden_size] * NUM_HIDDEN_LAYERS},
         device="cpu",
     )
-    model.learn(2 * steps)  # compiles, and fills the replay
-    seconds = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        model.learn(steps, reset_num_timesteps=False)
-        seconds.append(time.perf_counter() - started)
-    return steps / statistics.median(seconds)
+    model.learn(steps)  # compiles, and fills the replay
+    run = lambda: model.learn(steps, reset_num_timesteps=False)
+    return steps / common.median_seconds(run, repeats)
 
 
 PEERS = (

@@ -4,12 +4,8 @@ A segment of a preset on Ant, gradient steps and reward included, for all seeds 
 One seed stands for as many runs, one after another.
 """
 
-import statistics
-import time
 from collections.abc import Iterator
 from typing import Any
-
-import jax
 
 from benchmarks import common
 from maxent_jax import algorithm, runtime
@@ -20,13 +16,13 @@ def seconds_per_segment(config, repeats: int) -> float:
     """Median, after one segment to warm up; the state is donated, so that each goes on."""
     programs = algorithm.programs(config)
     state, _ = programs.begin(algorithm.start(config))
-    seconds = []
-    for _ in range(1 + repeats):
-        started = time.perf_counter()
+
+    def segment():
+        nonlocal state
         state, metrics = programs.train_segment(state)
-        jax.block_until_ready((state, metrics))
-        seconds.append(time.perf_counter() - started)
-    return statistics.median(seconds[1:])
+        return state, metrics
+
+    return common.median_seconds(segment, repeats)
 
 
 def measure(name: str, settings: dict[str, Any], counts, repeats: int) -> Iterator[dict[str, Any]]:

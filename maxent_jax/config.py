@@ -237,6 +237,14 @@ _PAPER: dict[str, tuple[Any, str]] = {
     "restart_temperature": (False, "the temperature restarts in each iteration"),
 }
 
+_FAST_LEARNER: dict[str, Any] = dict(
+    critic_layer_norm=True,
+    learning_rate=1e-3,
+    return_steps=3,
+    initial_temperature=0.1,
+    restart_temperature=True,
+)
+
 PRESETS: dict[str, dict[str, Any]] = {
     "smoke": dict(
         num_iterations=2,
@@ -257,11 +265,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         steps_per_iteration=120_000,
         updates_per_step=0.25,
         hidden_size=128,
-        critic_layer_norm=True,
-        learning_rate=1e-3,
-        return_steps=3,
-        initial_temperature=0.1,
-        restart_temperature=True,
+        **_FAST_LEARNER,
         replay_size=240_000,
     ),
     "gpu": dict(
@@ -271,11 +275,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         num_segments=20,
         updates_per_step=1 / 64,
         batch_size=4096,
-        critic_layer_norm=True,
-        learning_rate=1e-3,
-        return_steps=3,
-        initial_temperature=0.1,
-        restart_temperature=True,
+        **_FAST_LEARNER,
         reference_size=131_072,
         mixture_episodes=256,
     ),
@@ -402,16 +402,8 @@ _POSITIVE = (
 )
 _AT_MOST_ONE = ("torque_limit", "discount", "soft_update_rate", "eta")
 _NOT_NEGATIVE = (
-    *(
-        "seed",
-        "plateau_segments",
-        "plateau_tolerance",
-        "shaping",
-        "episodic_weight",
-        "yaw_copies",
-        "discount",
-        "target_entropy_scale",
-    ),
+    *("seed", "plateau_segments", "plateau_tolerance", "shaping", "episodic_weight"),
+    *("yaw_copies", "discount", "target_entropy_scale"),
 )
 
 

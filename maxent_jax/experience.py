@@ -124,13 +124,10 @@ def sample(
         rows.append(jnp.where(taken[-1], following, rows[-1]))
     last, steps = rows[-1], jnp.stack(rows, axis=-1)
 
-    previous = items.previous[first]
-    in_ring, row, start = _address(previous)
+    in_ring, row, start = _address(items.previous[first])
     observation = jnp.where(in_ring[..., None], items.state[row].astype(jnp.float32), starts[start])
     next_observation = items.state[last].astype(jnp.float32)
-    before = jnp.where(
-        in_ring[..., None, None], items.features[row], _start_features(parts, items, starts, first)
-    )
+    before = _features_left(parts, items, starts, first)
     variant = jnp.zeros(shape, jnp.int32)
     if items.angle is not None:
         variant = jax.random.randint(key_variant, shape, 0, 1 + config.yaw_copies)
@@ -162,10 +159,7 @@ def measure_all(parts: Parts, reference: Reference, ring: Replay, starts: jax.Ar
     """The replay with all its distances measured anew."""
     items: Step = ring.items
     every = jnp.arange(items.previous.shape[0])
-    in_ring, row, _ = _address(items.previous)
-    before = jnp.where(
-        in_ring[:, None, None], items.features[row], _start_features(parts, items, starts, every)
-    )
+    before = _features_left(parts, items, starts, every)
     distances = measure(parts, reference, before, items.features)
     return ring._replace(items=items._replace(distances=distances))
 
@@ -198,13 +192,15 @@ def _address(previous: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     return previous >= 0, jnp.maximum(previous, 0), jnp.maximum(-1 - previous, 0)
 
 
-def _start_features(parts: Parts, items: Step, starts: jax.Array, rows: jax.Array) -> jax.Array:
-    """[..., V, F] of the starts that the items in `rows` [...] left, if they left one."""
-    _, _, start = _address(items.previous[rows])
+def _features_left(parts: Parts, items: Step, starts: jax.Array, rows: jax.Array) -> jax.Array:
+    """[..., V, F] of the states that the items in `rows` [...] left."""
+    in_ring, row, start = _address(items.previous[rows])
     if items.angle is None and rows.size > starts.shape[0]:
-        return parts.phi(starts)[start][..., None, :]
-    angle = None if items.angle is None else items.angle[rows]
-    return _variants(parts, starts[start], angle)
+        of_start = parts.phi(starts)[start][..., None, :]
+    else:
+        angle = None if items.angle is None else items.angle[rows]
+        of_start = _variants(parts, starts[start], angle)
+    return jnp.where(in_ring[..., None, None], items.features[row], of_start)
 
 
 def _variants(parts: Parts, state: jax.Array, angle: jax.Array | None) -> jax.Array:
