@@ -9,8 +9,9 @@ from typing import Any, TypeVar
 
 import tyro
 
+from experiments.interruption import Interrupted
 from maxent_jax.config import ConfigError
-from maxent_jax.runs import RunError
+from maxent_jax.runs import NonFiniteError, RunError, SaveError
 
 Arguments = TypeVar("Arguments")
 
@@ -56,7 +57,10 @@ def flag_value(argv: Sequence[str], flag: str) -> str | None:
 
 
 def entry_point(main: Callable[[Sequence[str]], None]) -> Callable[[], None]:
-    """A main that ends on a user's mistake with one sentence and exit code 2."""
+    """A main that ends with one sentence where it can't go on.
+
+    Exit code 2 for a user's mistake, 1 for what the machine or the numbers did.
+    """
 
     @functools.wraps(main)
     def run() -> None:
@@ -65,8 +69,14 @@ def entry_point(main: Callable[[Sequence[str]], None]) -> Callable[[], None]:
         except (UsageError, ConfigError, RunError) as mistake:
             print(f"error: {mistake}", file=sys.stderr)
             sys.exit(2)
+        except (SaveError, NonFiniteError) as failure:
+            print(f"error: {failure}", file=sys.stderr)
+            sys.exit(1)
+        except Interrupted as stop:
+            print(stop, file=sys.stderr)
+            sys.exit(stop.exit_code)
         except KeyboardInterrupt:
-            print("interrupted: complete iterations are kept, see --resume", file=sys.stderr)
+            print("interrupted", file=sys.stderr)
             sys.exit(130)
 
     return run

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import numpy as np
 from jax.experimental import multihost_utils
 
 TIMEOUT = 20  # seconds until the others know that a process is gone, and end too
@@ -49,3 +50,10 @@ def first_alone(act: Callable[[], Any], where: str) -> None:
     if is_first():
         act()
     wait_for_all(where)
+
+
+def largest(*numbers: int) -> list[int]:
+    """Of each number the largest that any process has, so that all decide alike."""
+    if jax.process_count() == 1:
+        return list(numbers)
+    return np.max(multihost_utils.process_allgather(np.array(numbers)), axis=0).tolist()

@@ -4,15 +4,24 @@ A run's directory holds config.json, metrics.jsonl (one line an iteration), chec
 figures/. `--resume` goes on from the last complete checkpoint.
 """
 
+import contextlib
 import dataclasses
 import re
+import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import filelock
+
 from experiments import cli
+from experiments.sinks import Sinks
 from maxent_jax import runs
 from maxent_jax.config import Config, preset
+
+LOCK = "lock"  # held while a process trains; the system frees a dead one's
+# A preset is a name for values that are compared one by one.
+_FIELDS = [field for field in dataclasses.fields(Config) if field.name != "preset"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,7 +32,20 @@ class Arguments:
     out: Path | None = None
     """The run's directory; runs/ENV-METHOD-PRESET-SEED when left out."""
     resume: bool = False
-    """Go on from the last complete checkpoint in the run's directory; start over without one."""
+    """Go on from the last checkpoint in the run's directory; start over without one. With neither
+    --preset nor --env the settings are those of the run."""
+    fallback: bool = False
+    """With --resume: where the last checkpoint is damaged, remove it and take the one before."""
+    overwrite: bool = False
+    """Remove the run that is in the directory, and begin anew."""
+    save_iterations: int = 1
+    """Iterations between checkpoints; the last one is always saved."""
+    save_minutes: float = 10.0
+    """After so many minutes without a checkpoint, save between two segments of an iteration."""
+    tensorboard: bool = False
+    """Write metrics for TensorBoard too, into the run's directory (extra log)."""
+    wandb: str = ""
+    """Send metrics to that project of Weights & Biases too (extra log)."""
     devices: int = 1
     """Devices that share the run: seeds first, then environments. 0: all there are."""
     coordinator: str = ""
@@ -47,46 +69,109 @@ def read_arguments(argv: Sequence[str]) -> Arguments:
     Raises:
       UsageError, ConfigError, RunError: one sentence each.
     """
-    env = cli.flag_value(argv, "--env") or Config.env
-    config = preset(cli.flag_value(argv, "--preset") or Config.preset, env=env)
-    arguments = cli.parse(Arguments, argv, "experiments.train", default=Arguments(config))
+    default = Arguments(_default_config(argv))
+    arguments = cli.parse(Arguments, argv, "experiments.train", default=default)
+    _check_saving(arguments)
     _check_hosts(arguments)
+    Sinks(arguments.tensorboard, arguments.wandb).check()
     return arguments
 
 
-def claim_directory(arguments: Arguments) -> None:
-    """Makes the run's directory, unless it is there: then it is empty, or holds this very run.
+def _default_config(argv: Sequence[str]) -> Config:
+    """What flags change: a preset, or the settings of the run to be resumed."""
+    name, env = cli.flag_value(argv, "--preset"), cli.flag_value(argv, "--env")
+    out = cli.flag_value(argv, "--out")
+    if "--resume" in argv and out and not name and not env and Path(out, runs.CONFIG).exists():
+        return runs.read_config(Path(out))
+    return preset(name or Config.preset, env=env or Config.env)
+
+
+@contextlib.contextmanager
+def claimed(arguments: Arguments) -> Iterator[None]:
+    """Makes the run's directory, and keeps other processes out of it while inside.
 
     Raises:
-      UsageError, RunError: it does not, or cannot be made.
+      UsageError, RunError: see check_free; or it cannot be made, or another process trains in it.
     """
     directory = arguments.directory
-    if directory.is_file() or (directory.is_dir() and any(directory.iterdir())):
-        _check_resumed(arguments)
+    check_free(arguments)
+    lock = filelock.FileLock(directory / LOCK, timeout=0)
     try:
         directory.mkdir(parents=True, exist_ok=True)
+        lock.acquire()
+    except filelock.Timeout:
+        raise cli.UsageError(f"another process is training in {directory}.") from None
     except OSError as error:
         raise cli.UsageError(f"cannot write to {directory}: {error.strerror}.") from None
+    with lock:
+        check_free(arguments)  # again: another process may have been here meanwhile
+        if arguments.overwrite:
+            _remove_run(directory)
+        yield
 
 
-def _check_resumed(arguments: Arguments) -> None:
+def check_free(arguments: Arguments) -> None:
+    """Whether the directory is not there or empty, or holds a run that the arguments deal with.
+
+    Raises:
+      UsageError, RunError: it does not.
+    """
     directory = arguments.directory
-    if not arguments.resume:
+    taken = directory.is_file() or (
+        directory.is_dir() and any(path.name != LOCK for path in directory.iterdir())
+    )
+    if not taken:
+        return
+    if arguments.resume:
+        _check_resumed(directory, arguments.config)
+    elif not arguments.overwrite:
         raise cli.UsageError(
-            f"{directory} already exists: choose another --out, or add --resume to go on with it."
+            f"{directory} already exists: choose another --out, or add --resume to go on with it "
+            f"or --overwrite to begin anew."
         )
+    elif not (directory / runs.CONFIG).is_file():
+        raise cli.UsageError(f"{directory} is not the directory of a run: it is left as it is.")
+
+
+def _remove_run(directory: Path) -> None:
+    """All that a run writes, and nothing else."""
+    for name in runs.WRITTEN:
+        path = directory / name
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _check_resumed(directory: Path, config: Config) -> None:
     saved = runs.read_config(directory)
-    changed = [
-        field.name
-        for field in dataclasses.fields(Config)
-        if getattr(saved, field.name) != getattr(arguments.config, field.name)
-    ]
+    values = ((f.name, getattr(saved, f.name), getattr(config, f.name)) for f in _FIELDS)
+    changed = [f"{name} was {old} and is {new}" for name, old, new in values if old != new]
     if changed:
-        listed = ", ".join(
-            f"{name} was {getattr(saved, name)} and is {getattr(arguments.config, name)}"
-            for name in changed
-        )
-        raise cli.UsageError(f"{directory} holds a run with other settings: {listed}.")
+        raise cli.UsageError(f"{directory} holds a run with other settings: {', '.join(changed)}.")
+
+
+def _check_saving(arguments: Arguments) -> None:
+    for wrong, sentence in (
+        (
+            arguments.save_iterations < 1,
+            f"save-iterations is {arguments.save_iterations}, but must be at least 1.",
+        ),
+        (
+            not arguments.save_minutes > 0,
+            f"save-minutes is {arguments.save_minutes}, but must be a positive number.",
+        ),
+        (
+            arguments.resume and arguments.overwrite,
+            "resume and overwrite exclude each other.",
+        ),
+        (
+            arguments.fallback and not arguments.resume,
+            "fallback needs --resume.",
+        ),
+    ):
+        if wrong:
+            raise cli.UsageError(sentence)
 
 
 def _check_hosts(arguments: Arguments) -> None:
@@ -127,20 +212,30 @@ def main(argv: Sequence[str]) -> None:
     started = time.perf_counter()
     arguments = read_arguments(argv)
     num_devices = arguments.devices
+    holding: contextlib.AbstractContextManager[None] = claimed(arguments)
     if arguments.coordinator:
         from experiments import hosts  # loads jax
         from maxent_jax import runtime
 
         runtime.prepare(arguments.config.simulates_in_jax)  # before the first computation
         hosts.join(arguments.coordinator, arguments.num_processes, arguments.process_id)
-        claim_directory(arguments)  # by all, so that all end where it is taken
-        hosts.wait_for_all("directory")
+        check_free(arguments)  # by all, so that all end where it is taken
+        hosts.wait_for_all("checked")
         num_devices = 0
-    else:
-        claim_directory(arguments)
-    from experiments import driver  # loads jax
+        if not hosts.is_first():
+            holding = contextlib.nullcontext()
+    with holding:
+        from experiments import driver, hosts  # loads jax
 
-    driver.train(arguments.config, arguments.directory, started, num_devices)
+        hosts.wait_for_all("claimed")
+        options = driver.Options(
+            num_devices,
+            arguments.fallback,
+            arguments.save_iterations,
+            arguments.save_minutes,
+            Sinks(arguments.tensorboard, arguments.wandb),
+        )
+        driver.train(arguments.config, arguments.directory, started, options)
 
 
 def run() -> None:

@@ -1,24 +1,50 @@
-"""The whole state of a run on disk, and back. A step is the number of iterations completed.
+"""A run at one moment on disk, and back: its whole state, its config, and what it has measured.
 
-The archive and the visits are items of their own, so that analysis loads them without the replay.
+A checkpoint is a folder, named by how far the run has come. It is made under another name and
+renamed once it is complete and sealed, so what bears its name and is not whole is damaged. Archive
+and visits are an item of their own, so that analysis neither loads nor reads the replay.
 """
 
 import contextlib
+import functools
+import json
+import logging
+import os
+import re
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 from orbax.checkpoint import v1 as ocp
 
-from maxent_jax import algorithm
+from maxent_jax import algorithm, integrity, runs
 from maxent_jax.algorithm import State
 from maxent_jax.config import Config
+from maxent_jax.integrity import ARRAYS, FOLDER, UNFINISHED
 from maxent_jax.mixture import Archive
-from maxent_jax.runs import CheckpointError
+from maxent_jax.runs import CheckpointError, SaveError
 from maxent_jax.training import Visits
 
-FOLDER = "checkpoints"
-STEPS_KEPT = 2
+CHECKPOINTS_KEPT = 2
+# In a checkpoint's folder, beside its config.json and metrics.jsonl:
+PROGRESS, PARTIAL = "progress.json", "partial.npz"
+
+
+class Progress(NamedTuple):
+    """What a run has measured so far, of which its metrics are made."""
+
+    rows: list[dict[str, Any]]  # one for each complete iteration, as in metrics.jsonl
+    begun: dict[str, np.ndarray] | None  # of the beginning of the next, if it has begun
+    segments: list[dict[str, np.ndarray]]  # of its segments so far
+    clock: dict[str, Any]  # seconds by name
+
+    @property
+    def name(self) -> str:
+        """Of the checkpoint: 3 after three iterations, 3+7 after seven segments of the next."""
+        return f"{len(self.rows)}" + ("" if self.begun is None else f"+{len(self.segments)}")
 
 
 class Results(NamedTuple):
@@ -29,48 +55,118 @@ class Results(NamedTuple):
     random_visits: Visits
 
 
-def save(run_directory: Path, state: State, step: int) -> None:
-    """Writes the state; complete or, to all who look, not there. Older steps go.
+def save(run_directory: Path, state: State, progress: Progress, machine: dict[str, Any]) -> None:
+    """Writes a checkpoint whole or, to all who look, not at all. Older ones go.
 
-    With several processes each calls it, and writes its part of the state.
+    With several processes each calls it, and writes its part of the arrays.
 
     Args:
-      step: iterations completed.
+      machine: that the state was computed on, beside the versions of its software.
+    Raises:
+      SaveError: it cannot be written; those before are intact.
     """
-    with _open(run_directory, cleanup_tmp_directories=True) as checkpointer:
-        checkpointer.save_checkpointables(step, _items(_without_typed_key(state)), overwrite=True)
+    folder = run_directory / FOLDER
+    temporary = (folder / f"{UNFINISHED}{progress.name}").absolute()
+    first = jax.process_index() == 0
+    try:
+        if first:
+            shutil.rmtree(temporary, ignore_errors=True)
+            temporary.mkdir(parents=True)
+        with _silence():
+            ocp.save_checkpointables(temporary / ARRAYS, _items(_without_typed_key(state)))
+        if first:
+            shutil.copy(run_directory / runs.CONFIG, temporary)
+            runs.write_metrics(temporary, progress.rows)
+            _write_progress(temporary, progress, machine)
+            integrity.seal(temporary)
+            shutil.rmtree(folder / progress.name, ignore_errors=True)
+            temporary.rename(folder / progress.name)
+            for old in integrity.checkpoints(run_directory)[:-CHECKPOINTS_KEPT]:
+                shutil.rmtree(folder / old)
+    except (OSError, ValueError, SaveError) as error:  # tensorstore's are ValueErrors
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise SaveError(
+            f"cannot save checkpoint {progress.name} of {run_directory}: {_reason(error)}; "
+            f"those before it are intact."
+        ) from error
 
 
-def latest_step(run_directory: Path) -> int | None:
-    """The last complete step, None if there is none."""
-    if not (run_directory / FOLDER).is_dir():
-        return None
-    with _open(run_directory) as checkpointer:
-        return None if checkpointer.latest is None else checkpointer.latest.step
+def read_progress(run_directory: Path, name: str) -> tuple[Progress, dict[str, Any]]:
+    """What that checkpoint's run had measured, and what it was computed with."""
+    folder = run_directory / FOLDER / name
+    content = json.loads((folder / PROGRESS).read_text())
+    begun, segments = None, []
+    if content["begun"]:
+        with np.load(folder / PARTIAL) as arrays:
+            parts = {key: arrays[key] for key in arrays.files}
+        begun = _beneath("begun/", parts)
+        segments = [_beneath(f"{i}/", parts) for i in range(content["segments"])]
+    rows = runs.read_metrics(folder)
+    return Progress(rows, begun, segments, content["clock"]), content["computed_with"]
 
 
-def restore(run_directory: Path, config: Config, placed: State | None = None) -> State:
-    """The state of the last complete step, on whatever devices it was saved from.
+def restore(run_directory: Path, name: str, config: Config, placed: State | None = None) -> State:
+    """The state of that checkpoint, on whatever devices it was saved from.
 
     Args:
       placed: the sharding of each leaf, see devices.placement; one device if left out.
     Raises:
-      CheckpointError: there is none.
+      CheckpointError: it does not hold a state of this config.
     """
-    items = _load(run_directory, _items(_abstract(config, placed)))
+    items = _load(run_directory, name, _items(_abstract(config, placed)))
     results, rest = items["results"], items["rest"]
     learner = rest.learner._replace(visits=results.visits, random_visits=results.random_visits)
     key = jax.random.wrap_key_data(rest.key)
     return rest._replace(key=key, archive=results.archive, learner=learner)
 
 
-def restore_results(run_directory: Path, config: Config) -> Results:
-    """The archive and visits of the last complete step, without the replay.
+def restore_results(run_directory: Path, name: str, config: Config) -> Results:
+    """The archive and visits of that checkpoint, without the replay.
 
     Raises:
-      CheckpointError: there is none.
+      CheckpointError: it does not hold results of this config.
     """
-    return _load(run_directory, {"results": _items(_abstract(config))["results"]})["results"]
+    abstract = {"results": _items(_abstract(config))["results"]}
+    return _load(run_directory, name, abstract)["results"]
+
+
+def _write_progress(folder: Path, progress: Progress, machine: dict[str, Any]) -> None:
+    parts = {f"begun/{key}": value for key, value in (progress.begun or {}).items()}
+    for i, segment in enumerate(progress.segments):
+        parts |= {f"{i}/{key}": value for key, value in segment.items()}
+    if progress.begun is not None:
+        np.savez(folder / PARTIAL, **parts)  # type: ignore[arg-type]
+    content = {
+        "begun": progress.begun is not None,
+        "segments": len(progress.segments),
+        "clock": progress.clock,
+        "computed_with": runs.stack() | machine,
+    }
+    runs.write_json(folder / PROGRESS, content)
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Orbax's threads print whole tracebacks of what it raises as well."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+def _reason(error: Exception) -> str:
+    """In the system's words where they are known; TensorStore gives their number."""
+    code = re.search(r"os_error_code='(\d+)'", str(error))
+    if code:
+        return os.strerror(int(code[1]))
+    return getattr(error, "strerror", None) or str(error).splitlines()[0]
+
+
+def _beneath(prefix: str, parts: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {k.removeprefix(prefix): v for k, v in parts.items() if k.startswith(prefix)}
 
 
 def _items(state: State) -> dict[str, Any]:
@@ -100,23 +196,23 @@ def _abstract(config: Config, placed: State | None = None) -> State:
     )
 
 
-def _load(run_directory: Path, abstract: dict[str, Any]) -> dict[str, Any]:
-    step = latest_step(run_directory)
-    if step is None:
-        raise CheckpointError(f"{run_directory} holds no complete checkpoint.")
-    try:
-        with _open(run_directory) as checkpointer:
-            return checkpointer.load_checkpointables(step, abstract)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        reason = str(error).splitlines()[0]
-        raise CheckpointError(
-            f"checkpoint {step} of {run_directory} is damaged: {reason}"
-        ) from error
+def _load(run_directory: Path, name: str, abstract: dict[str, Any]) -> dict[str, Any]:
+    path = (run_directory / FOLDER / name / ARRAYS).absolute()
+    saved = ocp.checkpointables_metadata(path).metadata
+    for item, expected in abstract.items():
+        # Orbax itself would turn another dtype into the one expected, and say nothing.
+        wrong = _arrays(saved[item]) ^ _arrays(expected)
+        if wrong:
+            array, shape, dtype = min(wrong)
+            raise CheckpointError(
+                f"checkpoint {name} of {run_directory} does not fit its config: see {array}, "
+                f"{dtype} of shape {shape}."
+            )
+    return ocp.load_checkpointables(path, abstract)
 
 
-@contextlib.contextmanager
-def _open(run_directory: Path, **options):
-    keep = ocp.training.preservation_policies.LatestN(STEPS_KEPT)
-    folder = (run_directory / FOLDER).absolute()
-    with ocp.training.Checkpointer(folder, preservation_policy=keep, **options) as checkpointer:
-        yield checkpointer
+def _arrays(tree: Any) -> set[tuple[str, tuple[int, ...], str]]:
+    """The name, shape and dtype of each."""
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    keystr = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
+    return {(keystr(path), tuple(x.shape), str(x.dtype)) for path, x in leaves if x is not None}

@@ -1,18 +1,26 @@
 """A run's directory: its config, its metrics, and where the rest lies. Loads no array library."""
 
+import contextlib
 import dataclasses
 import importlib.metadata
 import json
 import math
 import os
 import platform
+import uuid
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from maxent_jax.config import Config, ConfigError
 
-SCHEMA = 2  # of the directory, checkpoints included
+SCHEMA = 3  # of the directory, checkpoints included
 CONFIG, METRICS, FIGURES = "config.json", "metrics.jsonl", "figures"
+# All that any entry point writes there.
+WRITTEN = (
+    *(CONFIG, METRICS, FIGURES, "checkpoints", "evaluation.json"),
+    *("videos", "report.html", "tensorboard", "wandb"),
+)
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint")
 
 
@@ -24,8 +32,26 @@ class CheckpointError(RunError):
     """A run without a checkpoint that can be loaded."""
 
 
+class CheckpointCorruptError(CheckpointError):
+    """A checkpoint that is not what was written."""
+
+
+class SaveError(RuntimeError):
+    """A file that could not be written; what was saved before it is intact."""
+
+
+class NonFiniteError(RuntimeError):
+    """Training left the finite numbers; nothing of it was saved."""
+
+
+def stack() -> dict[str, str]:
+    """The versions that a run's bits depend on."""
+    versions = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return {"python": platform.python_version()} | versions
+
+
 def write_config(
-    directory: Path, config: Config, method: dict[str, Any], machine: dict[str, str]
+    directory: Path, config: Config, method: dict[str, Any], machine: dict[str, Any]
 ) -> None:
     """config.json: every setting, what departs from the paper, the stack and the machine."""
     departures = {
@@ -34,6 +60,7 @@ def write_config(
     }
     content = {
         "schema": SCHEMA,
+        "id": uuid.uuid4().hex[:12],
         "config": dataclasses.asdict(config),
         "method": method,
         "deviations_from_the_paper": departures,
@@ -44,8 +71,7 @@ def write_config(
             * config.num_segments
             * config.num_iterations,
         },
-        "versions": {"python": platform.python_version()}
-        | {name: importlib.metadata.version(name) for name in PACKAGES},
+        "versions": stack(),
         "machine": machine,
     }
     write_json(directory / CONFIG, content)
@@ -73,10 +99,20 @@ def read_config(directory: Path) -> Config:
         raise RunError(f"{path} does not fit this release: {error}") from None
 
 
+def read_id(directory: Path) -> str:
+    """Of the run, drawn when it began."""
+    return json.loads((directory / CONFIG).read_text())["id"]
+
+
 def append_metrics(directory: Path, row: dict[str, Any]) -> None:
-    """One line of metrics.jsonl, on disk when this returns. What is not finite becomes null."""
-    with open(directory / METRICS, "a") as file:
-        file.write(json.dumps(_jsonable(row)) + "\n")
+    """One line of metrics.jsonl, on disk when this returns.
+
+    Raises:
+      SaveError: it cannot be written; an unfinished line is left out by all who read.
+    """
+    path = directory / METRICS
+    with writing(path), open(path, "a") as file:
+        file.write(_lines([row]))
         file.flush()
         os.fsync(file.fileno())
 
@@ -91,31 +127,54 @@ def read_metrics(directory: Path) -> list[dict[str, Any]]:
         raise RunError(f"{path} holds a line that is not JSON.") from None
 
 
-def truncate_metrics(directory: Path, num_iterations: int) -> list[dict[str, Any]]:
-    """The rows of the first iterations, which alone stay in the file: the rest is run again."""
-    rows = read_metrics(directory)[:num_iterations]
-    _replace(directory / METRICS, "".join(json.dumps(row) + "\n" for row in rows))
-    return rows
+def write_metrics(directory: Path, rows: list[dict[str, Any]]) -> None:
+    """metrics.jsonl with these rows and no others; where it has them, it is left as it is."""
+    path, text = directory / METRICS, _lines(rows)
+    if not path.exists() or path.read_text() != text:
+        _replace(path, text)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """A JSON file, whole or not at all. What is not finite becomes null."""
-    _replace(path, json.dumps(_jsonable(content), indent=2) + "\n")
+    _replace(path, json.dumps(jsonable(content), indent=2) + "\n")
 
 
-def _jsonable(value: Any) -> Any:
+def jsonable(value: Any) -> Any:
+    """The value in JSON's types. What is not finite becomes null."""
     if isinstance(value, dict):
-        return {key: _jsonable(item) for key, item in value.items()}
+        return {key: jsonable(item) for key, item in value.items()}
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, list):
-        return [_jsonable(item) for item in value]
+        return [jsonable(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
 
 
+@contextlib.contextmanager
+def writing(path: Path, temporary: Path | None = None) -> Iterator[None]:
+    """Turns a full disk or a missing permission into one sentence, and leaves no temporary file.
+
+    Raises:
+      SaveError: what is done inside met an OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+        raise SaveError(
+            f"cannot write {path}: {error.strerror or error}; what was saved before is intact."
+        ) from error
+
+
+def _lines(rows: list[dict[str, Any]]) -> str:
+    return "".join(json.dumps(jsonable(row)) + "\n" for row in rows)
+
+
 def _replace(path: Path, text: str) -> None:
     temporary = path.with_suffix(path.suffix + ".tmp")
-    temporary.write_text(text)
-    os.replace(temporary, path)
+    with writing(path, temporary):
+        temporary.write_text(text)
+        os.replace(temporary, path)

@@ -31,7 +31,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from maxent_jax import algorithm, checkpoint, devices, runtime
+from maxent_jax import algorithm, checkpoint, devices, runs, runtime
 from maxent_jax.config import preset
 
 runtime.prepare(simulates_in_jax=False)
@@ -83,9 +83,10 @@ calls = [x for x in program.splitlines() if 'custom_call_target="maxent_' in x]
 for line in calls if num_seeds > 1 else ():
     assert not re.search(rf"[[]{num_seeds},", line.split("custom-call")[0]), line
 
-checkpoint.save(directory, many, 1)
-compare(one, checkpoint.restore(directory, config))
-compare(one, checkpoint.restore(directory, config, placed))
+runs.write_config(directory, config, {}, {})
+checkpoint.save(directory, many, checkpoint.Progress([], None, [], {}), {})
+compare(one, checkpoint.restore(directory, "0", config))
+compare(one, checkpoint.restore(directory, "0", config, placed))
 print("equal")
 """
 

@@ -1,0 +1,1 @@
+"""What can be done to a run without harm: `python -m benchmarks.faults`, a part a file."""

@@ -1,0 +1,46 @@
+"""Does a run survive what can befall it? A row for each fault: how often it was caused, what came.
+
+Parts run one after another; each row is printed as soon as it is known. `--toy` causes each fault
+once or a few times.
+"""
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+
+from benchmarks import common
+from benchmarks.faults import crowd, damage, disk, inputs, numbers, saves, stops
+from maxent_jax import runtime
+
+PARTS = {
+    "inputs": inputs,
+    "stops": stops,
+    "damage": damage,
+    "disk": disk,
+    "crowd": crowd,
+    "numbers": numbers,
+    "saves": saves,
+}
+
+
+def main() -> None:
+    flags = argparse.ArgumentParser(description=__doc__)
+    flags.add_argument("--toy", action="store_true", help="each fault once or a few times")
+    flags.add_argument("--part", nargs="+", choices=PARTS, default=list(PARTS))
+    args = flags.parse_args()
+    common.print_versions()
+    runtime.prepare(simulates_in_jax=False)
+    rows = []
+    for name in args.part:
+        with tempfile.TemporaryDirectory() as folder:
+            for row in PARTS[name].measure(Path(folder), args.toy):
+                rows.append(common.progress({"benchmark": "faults", "part": name, **row}))
+    for row in rows:
+        common.emit(row)
+    if not all(row["passed"] for row in rows):
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

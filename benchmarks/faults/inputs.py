@@ -1,0 +1,144 @@
+"""Is every mistake at the command line one sentence, at once, and exit code 2?"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from maxent_jax import runs
+from maxent_jax.config import preset
+
+SECONDS = 3.0
+
+
+class Mistake(NamedTuple):
+    """A command line that cannot be right."""
+
+    module: str
+    arguments: str
+    says: str  # among other words
+    without: str = ""  # a package that is taken for missing
+    environment: tuple[str, str] = ("", "")
+
+
+def train(arguments: str, says: str) -> Mistake:
+    """Of training."""
+    return Mistake("experiments.train", arguments, says)
+
+
+MISTAKES = (
+    train("--env antt", "did you mean 'ant'"),
+    train("--env brax:antt", "did you mean 'brax:ant'"),
+    train("--method w", "unknown method 'w'"),
+    train("--preset quik", "did you mean 'quick'"),
+    train("--backend mjxx", "did you mean 'mjx'"),
+    train("--physics fats", "did you mean 'fast'"),
+    train("--reward liner", "did you mean 'linear'"),
+    train("--weights geometrical", "did you mean 'geometric'"),
+    train("--presett quick", "did you mean --preset"),
+    train("--nonsense", "--nonsense"),
+    train("--num-envs -3", "num-envs is -3"),
+    train("--num-envs 0", "num-envs is 0"),
+    train("--num-envs many", "--num-envs"),
+    train("--num-envs 2.5", "--num-envs"),
+    train("--num-iterations", "--num-iterations"),
+    train("--num-seeds 0", "num-seeds is 0"),
+    train("--seed -1", "seed is -1"),
+    train("--learning-rate nan", "learning-rate is nan"),
+    train("--learning-rate 0", "learning-rate is 0"),
+    train("--discount 1.5", "discount is 1.5"),
+    train("--eta 0", "eta is 0"),
+    train("--eta 1.5", "eta is 1.5"),
+    train("--reward-scale inf", "reward-scale is inf"),
+    train("--preset smoke --num-neighbors 256", "below reference-size = 256"),
+    train("--preset smoke --batch-size 4000", "must not exceed replay-size"),
+    train("--preset smoke --steps-per-iteration 401", "must be a multiple"),
+    train("--env pendulum --backend mjx", "pendulum has only: auto"),
+    train("--env walker2d --policy-inputs heading", "no floating torso"),
+    train("--devices -1", "devices is -1"),
+    train("--num-processes 2", "need --coordinator"),
+    train("--save-iterations 0", "save-iterations is 0"),
+    train("--save-minutes 0", "save-minutes is 0"),
+    train("--fallback", "fallback needs --resume"),
+    train("--resume --overwrite", "exclude each other"),
+    train("--out {run}", "already exists"),
+    train("--out {file}", "already exists"),
+    train("--out {file}/run", "cannot write"),
+    train("--out {foreign} --resume", "not the directory of a run"),
+    train("--out {foreign} --overwrite", "left as it is"),
+    train("--out {newer} --resume", "schema 99"),
+    train("--preset smoke --seed 7 --out {run} --resume", "seed was 0 and is 7"),
+    Mistake("experiments.train", "--wandb project", "maxent_jax[log]", without="wandb"),
+    Mistake("experiments.train", "--tensorboard", "maxent_jax[log]", without="tensorboardX"),
+    Mistake("experiments.evaluate", "{missing}", "not the directory of a run"),
+    Mistake("experiments.evaluate", "{run} --episodes 0", "at least 1"),
+    Mistake("experiments.evaluate", "{newer}", "schema 99"),
+    Mistake("experiments.verify", "{empty}", "not the directory of a run"),
+    Mistake("experiments.verify", "{run}", "no complete checkpoint"),
+    Mistake("experiments.verify", "", "directory"),
+)
+
+
+def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
+    """One row; what was not met as it should be is in it."""
+    places = _places(folder)
+    mistakes = MISTAKES[:: 3 if short else 1]
+    found = [_make(mistake, places) for mistake in mistakes]
+    met = zip(mistakes, found, strict=True)
+    wrong = [f"{m.module} {m.arguments}: {what}" for m, (what, _) in met if what]
+    yield {
+        "fault": "a mistake at the command line",
+        "times": len(mistakes),
+        "met by one sentence and exit code 2": len(mistakes) - len(wrong),
+        "slowest, seconds": max(seconds for _, seconds in found),
+        "wrong": wrong,
+        "passed": not wrong,
+    }
+
+
+def _places(folder: Path) -> dict[str, Path]:
+    """Directories, by what is wrong with them."""
+    places = {name: folder / name for name in ("missing", "empty", "foreign", "newer", "run")}
+    for name in ("empty", "foreign", "newer", "run"):
+        places[name].mkdir()
+    (places["foreign"] / "thesis.tex").write_text("")
+    (places["newer"] / runs.CONFIG).write_text(json.dumps({"schema": 99, "config": {}}))
+    runs.write_config(places["run"], preset("smoke"), {}, {})
+    places["file"] = folder / "file"
+    places["file"].write_text("")
+    return places
+
+
+def _make(mistake: Mistake, places: dict[str, Path]) -> tuple[str, float]:
+    """What is wrong with how it is met, "" for nothing, and the seconds that took."""
+    arguments = mistake.arguments.format(**places).split()
+    code = (
+        f"import runpy, sys; sys.modules[{mistake.without!r}] = None; "
+        f"sys.argv = {['', *arguments]!r}; "
+        f"runpy.run_module({mistake.module!r}, run_name='__main__')"
+    )
+    started = time.perf_counter()
+    name, value = mistake.environment
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | ({name: value} if name else {}),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    seconds = round(time.perf_counter() - started, 2)
+    said = done.stderr
+    for right, otherwise in (
+        (done.returncode == 2, f"exit code {done.returncode}: {said[-200:]}"),
+        (said.startswith("error: ") and said.count("\n") == 1, f"no single sentence: {said}"),
+        (mistake.says in said, f"said: {said}"),
+        (not done.stdout, f"printed: {done.stdout}"),
+        (seconds <= SECONDS, f"took {seconds} s"),
+    ):
+        if not right:
+            return otherwise, seconds
+    return "", seconds

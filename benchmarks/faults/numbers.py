@@ -1,0 +1,76 @@
+"""Numbers that are not finite: in an observation they are contained, elsewhere they end the run."""
+
+import contextlib
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import driver
+from maxent_jax import checkpoint, envs, integrity, runs
+from maxent_jax.config import preset
+from maxent_jax.envs.pendulum import Pendulum
+from maxent_jax.runs import NonFiniteError
+
+
+class Faulty(Pendulum):
+    """A pendulum whose state is lost on one side."""
+
+    def step(self, state, action):
+        """As the pendulum's, or not a number."""
+        after = super().step(state, action)
+        lost = after.obs[1] > 0.1  # sin θ
+        return after.replace(obs=jnp.where(lost, jnp.nan, after.obs))
+
+
+def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
+    """A row for each place where a number is lost; the last two overflow by a setting of theirs."""
+    envs.register("faulty", lambda backend, physics: Faulty())
+    directory = folder / "observation"
+    error = _train(directory, env="user:faulty")
+    counted = sum(row["num_invalid"] for row in runs.read_metrics(directory))
+    yield {
+        "fault": "nan in an observation",
+        "times": 1,
+        "counted": counted,
+        "non-finite in checkpoints": _num_not_finite(directory),
+        "passed": not error and counted > 0 and not _num_not_finite(directory),
+    }
+    for what, setting in (("reward", "reward_scale"), ("gradient", "learning_rate")):
+        directory = folder / what
+        error = _train(directory, env="pendulum", **{setting: 3e38})
+        found = _num_not_finite(directory)
+        yield {
+            "fault": f"overflow in the {what}",
+            "times": 1,
+            "said": error.replace(str(folder), "DIR"),
+            "non-finite in checkpoints": found,
+            "passed": "iteration 1 left the finite numbers" in error and not found,
+        }
+
+
+def _train(directory: Path, **changes: Any) -> str:
+    """Of a smoke run, saved at every boundary: what it ended with."""
+    directory.mkdir()
+    config = preset("smoke", **changes)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            driver.train(config, directory, time.perf_counter(), driver.Options(save_minutes=1e-9))
+    except NonFiniteError as error:
+        return str(error)
+    return ""
+
+
+def _num_not_finite(directory: Path) -> int:
+    """In all checkpoints, and in all but the missing values of the metrics."""
+    config, found = runs.read_config(directory), 0
+    for name in integrity.checkpoints(directory):
+        state = checkpoint.restore(directory, name, config)
+        for leaf in jax.tree.leaves(state._replace(key=state.iteration)):
+            found += int(np.sum(~np.isfinite(np.asarray(leaf, np.float64))))
+    return found

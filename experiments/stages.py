@@ -1,0 +1,105 @@
+"""A run goes on by one program at a time: the beginning of an iteration, a segment, or its end."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.clock import Clock
+from experiments.display import Bar
+from maxent_jax import algorithm, integrity, runs
+from maxent_jax.algorithm import Programs, State
+from maxent_jax.checkpoint import Progress
+from maxent_jax.config import Config
+from maxent_jax.convergence import has_plateaued
+
+
+class Stage(NamedTuple):
+    """Where a run stands."""
+
+    state: State
+    progress: Progress
+
+
+def advance(
+    config: Config,
+    programs: Programs,
+    state: State,
+    progress: Progress,
+    clock: Clock,
+    bar: Bar,
+) -> Stage:
+    """The next of the three programs of an iteration, with the clock read and the bar moved."""
+    if progress.begun is None:
+        state, begun = clock.time("wall_begin", programs.begin, state)
+        return Stage(state, progress._replace(begun=begun))
+    if not _trained(config, progress.segments):
+        state, metrics = clock.time("wall_train", programs.train_segment, state)
+        bar.segment_done()
+        return Stage(state, progress._replace(segments=[*progress.segments, metrics]))
+    state, at_end = clock.time("wall_end", programs.end, state)
+    row = runs.jsonable(_row(config, progress, at_end) | clock.end_iteration())
+    bar.iteration_done(row)
+    return Stage(state, progress._replace(rows=[*progress.rows, row], begun=None, segments=[]))
+
+
+def _row(config: Config, progress: Progress, at_end: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The line of metrics.jsonl for an iteration, but for its times."""
+    segments = progress.segments
+    stacked = jax.tree.map(lambda *x: np.stack(x), *segments)
+    rewards = np.full((*stacked["step_reward"].shape[1:], config.num_segments), np.nan)
+    rewards[..., : len(segments)] = np.moveaxis(stacked["step_reward"], 0, -1)
+    return {
+        **at_end,
+        **(progress.begun or {}),
+        **jax.tree.map(np.asarray, algorithm.reduce_metrics(stacked)),
+        "segments_trained": len(segments),
+        "converged": _all_converged(config, segments),
+        "segment_reward": rewards,
+    }
+
+
+def _trained(config: Config, segments: list[dict[str, np.ndarray]]) -> bool:
+    """Whether the iteration's budget is spent, or its reward has stopped rising."""
+    if not segments:
+        return False
+    return len(segments) == config.num_segments or _all_converged(config, segments)
+
+
+def _all_converged(config: Config, segments: list[dict[str, np.ndarray]]) -> bool:
+    """Of all seeds, which train in step."""
+    rewards = np.stack([metrics["step_reward"] for metrics in segments], axis=-1)
+    return all(
+        has_plateaued(list(of_seed), config.plateau_segments, config.plateau_tolerance)
+        for of_seed in np.atleast_2d(rewards)
+    )
+
+
+def check_finite(directory: Path, state: State, progress: Progress) -> None:
+    """Before anything of it is written.
+
+    Raises:
+      NonFiniteError: a number of the state is not finite.
+    """
+    leaves = jax.tree_util.tree_flatten_with_path(_finite(state))[0]
+    wrong = [path for path, is_finite in leaves if not is_finite]
+    if wrong:
+        where = jax.tree_util.keystr(wrong[0], simple=True, separator=".")
+        iteration = len(progress.rows) + (progress.begun is not None)
+        raise runs.NonFiniteError(
+            f"iteration {iteration} left the finite numbers after {len(progress.segments)} of its "
+            f"segments (first in {where}); nothing of that is saved, {directory} holds the run "
+            f"up to checkpoint {(integrity.checkpoints(directory) or ['none'])[-1]}."
+        )
+
+
+@jax.jit
+def _finite(state: State) -> State:
+    """Of each leaf, whether all its numbers are finite."""
+
+    def of_leaf(x: jax.Array) -> jax.Array:
+        return jnp.isfinite(x).all() if jnp.issubdtype(x.dtype, jnp.floating) else jnp.array(True)
+
+    return jax.tree.map(of_leaf, state)

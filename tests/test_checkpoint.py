@@ -1,0 +1,119 @@
+"""What is saved comes back to the bit, wherever in an iteration a run was stopped."""
+
+import shutil
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import maxent_jax
+from experiments import driver
+from experiments.interruption import Interrupted, Interruption
+from maxent_jax import algorithm, checkpoint, integrity, runs
+from maxent_jax.checkpoint import Progress
+from maxent_jax.config import preset
+
+GOLDEN = Path(__file__).parent / "golden"
+
+
+def arrays(state):
+    return jax.tree.map(np.asarray, state._replace(key=jax.random.key_data(state.key)))
+
+
+def timeless(directory):
+    rows = runs.read_metrics(directory)
+    return [{k: v for k, v in row.items() if not k.startswith("wall_")} for row in rows]
+
+
+def restored(directory):
+    name, _ = integrity.find(directory)
+    return arrays(checkpoint.restore(directory, name, runs.read_config(directory)))
+
+
+class StopAt(Interruption):
+    """As if a signal came before the n-th boundary."""
+
+    def __init__(self, boundaries):
+        self.boundaries = boundaries
+
+    @property
+    def received(self):
+        self.boundaries -= 1
+        return 15 if self.boundaries == 0 else None
+
+
+@pytest.mark.parametrize(("method", "period"), [("h", -1), ("la", 10), ("v", -1)])
+def test_a_run_stopped_anywhere_ends_as_one_that_was_not(tmp_path, monkeypatch, method, period):
+    config = preset("smoke", env="pendulum", method=method, refresh_period=period, num_seeds=2)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    for directory in (whole, broken):
+        directory.mkdir()
+    driver.train(config, whole, time.perf_counter())
+    seen = []
+    for boundary in (1, 1, 2, 1):  # begun; a segment; the iteration's end; begun again
+        monkeypatch.setattr(driver, "Interruption", lambda n=boundary: StopAt(n))
+        with pytest.raises(Interrupted) as stopped:
+            driver.train(config, broken, time.perf_counter())
+        assert stopped.value.exit_code == 143
+        seen += integrity.checkpoints(broken)[-1:]
+    monkeypatch.undo()
+    driver.train(config, broken, time.perf_counter())
+    assert seen == ["0+0", "0+1", "1", "1+0"]
+    assert timeless(broken) == timeless(whole)
+    pairs = zip(jax.tree.leaves(restored(broken)), jax.tree.leaves(restored(whole)), strict=True)
+    assert all(x.tobytes() == y.tobytes() for x, y in pairs)
+
+
+def test_a_checkpoint_holds_all_that_was_measured(tmp_path):
+    config = preset("smoke", env="pendulum")
+    runs.write_config(tmp_path, config, {}, {})
+    state = algorithm.start(config)
+    begun = {"weights": np.array([1, 0], np.float32), "num": np.array(3)}
+    segments = [{"reward": np.array(np.nan, np.float32)}, {"reward": np.array(0.1, np.float32)}]
+    saved = Progress([{"iteration": 1, "x": None}], begun, segments, {"parts": {"a": 0.1}})
+    for name in ("1+2", "1+2"):  # the second takes the first one's place
+        checkpoint.save(tmp_path, state, saved, {"device": "abacus"})
+        assert integrity.checkpoints(tmp_path) == [name]
+    progress, computed_with = checkpoint.read_progress(tmp_path, "1+2")
+    assert progress.rows == saved.rows and progress.clock == saved.clock
+    np.testing.assert_equal((progress.begun, progress.segments), (begun, segments))
+    assert progress.segments[0]["reward"].dtype == np.float32
+    assert computed_with["device"] == "abacus"
+    assert computed_with["jax"] == jax.__version__
+    back = checkpoint.restore(tmp_path, "1+2", config)
+    pairs = zip(jax.tree.leaves(arrays(back)), jax.tree.leaves(arrays(state)), strict=True)
+    assert all(x.tobytes() == y.tobytes() for x, y in pairs)
+
+
+def test_two_checkpoints_are_kept(tmp_path):
+    config = preset("smoke", env="pendulum")
+    runs.write_config(tmp_path, config, {}, {})
+    state = algorithm.start(config)
+    for i in range(4):
+        checkpoint.save(tmp_path, state, Progress([{}] * i, None, [], {}), {})
+    assert integrity.checkpoints(tmp_path) == ["2", "3"]
+
+
+def test_a_checkpoint_of_another_config_does_not_fit(tmp_path):
+    config = preset("smoke", env="pendulum")
+    runs.write_config(tmp_path, config, {}, {})
+    checkpoint.save(tmp_path, algorithm.start(config), Progress([], None, [], {}), {})
+    with pytest.raises(runs.CheckpointError, match="does not fit its config"):
+        checkpoint.restore_results(tmp_path, "0", preset("smoke", env="pendulum", hidden_size=16))
+
+
+def test_the_checkpoint_of_this_release_loads(tmp_path):
+    """The first release with this schema made it; see golden/README.md."""
+    directory = tmp_path / "golden"
+    shutil.copytree(GOLDEN, directory)
+    run = maxent_jax.load_run(directory)
+    expected = np.load(GOLDEN.with_suffix(".npz"))
+    states = jax.numpy.asarray(expected["states"])
+    np.testing.assert_array_equal(run.histogram, expected["histogram"])
+    for i in range(run.num_policies):
+        actions = run.policy(i)(states, jax.random.key(0))
+        np.testing.assert_allclose(actions, expected["actions"][i], atol=1e-5)
+    assert restored(directory).learner.env_steps == 400
+    assert sum(path.stat().st_size for path in GOLDEN.rglob("*") if path.is_file()) < 1e6

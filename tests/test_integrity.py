@@ -1,0 +1,69 @@
+"""Manifests, against coreutils' own reading of them, and what is refused."""
+
+import os
+import subprocess
+
+import pytest
+
+from maxent_jax import integrity, runs
+from maxent_jax.integrity import FOLDER, MANIFEST
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Two sealed checkpoints, without arrays."""
+    (tmp_path / runs.CONFIG).write_text("{}")
+    for name in ("9", "10+2"):
+        folder = tmp_path / FOLDER / name
+        (folder / "arrays" / "rest").mkdir(parents=True)
+        (folder / runs.CONFIG).write_text("{}")
+        (folder / "arrays" / "data").write_bytes(os.urandom(1000))
+        (folder / "arrays" / "rest" / "replay").write_bytes(os.urandom(1000))
+        integrity.seal(folder)
+    return tmp_path
+
+
+def test_a_manifest_is_one_that_sha256sum_checks(run):
+    folder = run / FOLDER / "9"
+    subprocess.run(["sha256sum", "--strict", "-c", MANIFEST], cwd=folder, check=True)
+    (folder / "arrays" / "data").write_text("other")
+    done = subprocess.run(["sha256sum", "-c", MANIFEST], cwd=folder, check=False)
+    assert done.returncode == 1
+
+
+def test_checkpoints_are_ordered_by_how_far_they_are(run):
+    for name in ("10", "10+0", "2+11", "unfinished-11", "notes"):
+        (run / FOLDER / name).mkdir()
+    assert integrity.checkpoints(run) == ["2+11", "9", "10", "10+0", "10+2"]
+    integrity.clear_unfinished(run)
+    assert not (run / FOLDER / "unfinished-11").exists()
+
+
+def test_analysis_passes_by_what_it_does_not_read(run):
+    (run / FOLDER / "10+2" / "arrays" / "rest" / "replay").write_text("lost")
+    assert integrity.find(run, whole=False) == ("10+2", {})
+    with pytest.raises(runs.CheckpointCorruptError, match="arrays/rest/replay"):
+        integrity.find(run)
+    name, passed_over = integrity.find(run, fallback=True)
+    assert name == "9" and list(passed_over) == ["10+2"]
+
+
+def test_a_config_that_was_changed_by_hand_is_noticed(run):
+    (run / runs.CONFIG).write_text('{"seed": 1}')
+    with pytest.raises(runs.CheckpointCorruptError, match=r"config\.json of the run"):
+        integrity.find(run)
+
+
+def test_where_all_are_damaged_there_is_nothing_to_fall_back_to(run):
+    for name in integrity.checkpoints(run):
+        (run / FOLDER / name / MANIFEST).unlink()
+    with pytest.raises(runs.CheckpointCorruptError, match="none before it is intact"):
+        integrity.find(run, fallback=True)
+
+
+def test_a_manifest_without_a_line_is_not_its_own(run):
+    manifest = run / FOLDER / "10+2" / MANIFEST
+    lines = manifest.read_text().splitlines(keepends=True)
+    for i in range(len(lines)):
+        manifest.write_text("".join(lines[:i] + lines[i + 1 :]))
+        assert list(integrity.damages(run, "10+2")) == [f"{MANIFEST} is not what was written"]

@@ -1,0 +1,44 @@
+"""Signals, sent to a process that is busy outside of Python."""
+
+import signal
+import subprocess
+import sys
+import time
+
+# The main thread sleeps in C, where no handler of Python's runs; a signal ends the first of its naps.
+BUSY = """
+import ctypes, sys
+from experiments.interruption import Interruption
+with Interruption() as interruption:
+    print("busy", flush=True)
+    for _ in range(3):
+        ctypes.CDLL(None).usleep(1_000_000)
+    print(interruption.received, flush=True)
+"""
+
+
+def busy():
+    process = subprocess.Popen(
+        [sys.executable, "-c", BUSY], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "busy\n"
+    return process
+
+
+def test_the_first_signal_is_remembered_and_answered():
+    for number in (signal.SIGINT, signal.SIGTERM):
+        process = busy()
+        process.send_signal(number)
+        assert process.stderr.readline().startswith("stopping at the next checkpoint")
+        out, _ = process.communicate()
+        assert process.returncode == 0 and out == f"{int(number)}\n"
+
+
+def test_a_second_ctrl_c_ends_at_once():
+    process = busy()
+    process.send_signal(signal.SIGTERM)
+    process.stderr.readline()
+    sent = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    process.communicate()
+    assert process.returncode == 130 and time.monotonic() - sent < 1
