@@ -156,9 +156,8 @@ def _train(
     clock = Clock(process_started, progress.clock)
     bar = Bar(config, done, len(progress.segments), progress.rows[-1] if done else {})
     sinks = options.sinks if hosts.is_first() else Sinks()
-    pass_on = sinks.open(directory, config, done)
     saved_at = time.perf_counter()
-    with Interruption() as interruption, bar:
+    with Interruption() as interruption, sinks.open(directory, config, done) as pass_on, bar:
         while done < config.num_iterations:
             state, progress = advance(config, programs, state, progress, clock, bar)
             check_finite(directory, state, progress)

@@ -1,8 +1,9 @@
 """Where metrics go beside metrics.jsonl: TensorBoard's files, Weights & Biases. Both are extras."""
 
+import contextlib
 import dataclasses
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +14,8 @@ from maxent_jax import runs
 from maxent_jax.config import Config
 
 Row = dict[str, Any]
+Scalars = dict[str, float]
+Sink = Callable[[Row], None]
 
 
 class Sinks(NamedTuple):
@@ -33,63 +36,59 @@ class Sinks(NamedTuple):
                     f'pip install "maxent_jax[log]".'
                 )
 
-    def open(self, directory: Path, config: Config, iteration: int) -> Callable[[Row], None]:
-        """A function that takes the row of each iteration after that one, and passes it on."""
-        passes: list[Callable[[int, dict[str, float]], None]] = []
-        if self.tensorboard:
-            passes.append(_tensorboard(directory, iteration))
-        if self.wandb:
-            passes.append(_wandb(directory, self.wandb, config))
+    @contextlib.contextmanager
+    def open(self, directory: Path, config: Config, iteration: int) -> Iterator[Sink]:
+        """A function that passes on the row of each iteration after that one."""
+        with contextlib.ExitStack() as opened:
+            sinks: list[Callable[[int, Scalars], Any]] = []
+            if self.tensorboard:
+                sinks.append(opened.enter_context(_tensorboard(directory, iteration)))
+            if self.wandb:
+                sinks.append(opened.enter_context(_wandb(directory, self.wandb, config)))
 
-        def add(row: Row) -> None:
-            values = scalars(row)
-            for pass_on in passes:
-                pass_on(row_iteration(row), values)
+            def pass_on(row: Row) -> None:
+                iteration = int(np.ravel(row["iteration"])[0])  # that of all seeds
+                for sink in sinks:
+                    sink(iteration, scalars(row))
 
-        return add
+            yield pass_on
 
 
-def scalars(row: Row) -> dict[str, float]:
-    """The numbers of a row by name; name/0, name/1 ... where a column has several."""
-    values: dict[str, float] = {}
+def scalars(row: Row) -> Scalars:
+    """The finite numbers of a row by name; name/0, name/1 ... where a column has several."""
+    values: Scalars = {}
     for name, value in row.items():
         flat = np.asarray(value, float).ravel()  # None becomes nan
-        if flat.size == 1:
-            values[name] = float(flat[0])
-        else:
-            values |= {f"{name}/{i}": float(x) for i, x in enumerate(flat)}
+        names = [name] if flat.size == 1 else [f"{name}/{i}" for i in range(flat.size)]
+        values |= {n: float(x) for n, x in zip(names, flat, strict=True) if np.isfinite(x)}
     return values
 
 
-def row_iteration(row: Row) -> int:
-    """The iteration that a row is of, the same for all seeds."""
-    return int(np.ravel(row["iteration"])[0])
-
-
-def _tensorboard(directory: Path, iteration: int) -> Callable[[int, dict[str, float]], None]:
+@contextlib.contextmanager
+def _tensorboard(directory: Path, iteration: int) -> Iterator[Callable[[int, Scalars], None]]:
     from tensorboardX import SummaryWriter
 
-    # Rows after the checkpoint that a run resumes from are shown once.
-    writer = SummaryWriter(str(directory / "tensorboard"), purge_step=iteration + 1)
-
-    def pass_on(iteration: int, values: dict[str, float]) -> None:
+    def write(iteration: int, values: Scalars) -> None:
         for name, value in values.items():
             writer.add_scalar(name, value, iteration)
         writer.flush()
 
-    return pass_on
+    # Of rows that a resumed run makes again, the earlier are not shown.
+    with SummaryWriter(str(directory / "tensorboard"), purge_step=iteration + 1) as writer:
+        yield write
 
 
+@contextlib.contextmanager
 def _wandb(
     directory: Path, project: str, config: Config
-) -> Callable[[int, dict[str, float]], None]:
+) -> Iterator[Callable[[int, Scalars], None]]:
     import wandb
 
-    run = wandb.init(
+    with wandb.init(
         project=project,
         config=dataclasses.asdict(config),
         dir=directory,
         id=runs.read_id(directory),
         resume="allow",
-    )
-    return lambda iteration, values: run.log(values, step=iteration)
+    ) as run:
+        yield lambda iteration, values: run.log(values, step=iteration)
