@@ -1,17 +1,21 @@
 """Loads a run, rolls its mixture out anew, and reports what it covers.
 
-Prints a table and writes evaluation.json and figures/ into the run's directory.
+Prints a table and writes evaluation.json and figures/ into the run's directory. With --gymnasium it
+also plays the policies in Gymnasium's own environment, and reports the sim-to-sim gap.
 """
 
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from experiments import cli
 from maxent_jax import runs
+
+if TYPE_CHECKING:
+    from maxent_jax.analysis import Run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,6 +30,10 @@ class Arguments:
     """Of the rollouts; training evaluates with 0."""
     seed_index: int = 0
     """Which of the seeds trained side by side."""
+    gymnasium: bool = False
+    """Also play as many episodes in Gymnasium (ant, walker2d, humanoid), on C MuJoCo in float64."""
+    fallback: bool = False
+    """Where the last checkpoint is damaged, take the one before."""
 
 
 def main(argv: Sequence[str]) -> None:
@@ -37,6 +45,10 @@ def main(argv: Sequence[str]) -> None:
     from maxent_jax import runtime
 
     runtime.prepare(config.simulates_in_jax)
+    if arguments.gymnasium:
+        from maxent_jax import gymnasium_play
+
+        gymnasium_play.make(config).close()  # what is wrong is said before anything is rolled out
     report = evaluate(arguments)
     runs.write_json(arguments.directory / "evaluation.json", report)
     _print(report)
@@ -50,7 +62,7 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
     from maxent_jax import analysis, plotting
     from maxent_jax.density import histogram
 
-    run = analysis.load_run(arguments.directory, arguments.seed_index)
+    run = analysis.load_run(arguments.directory, arguments.seed_index, arguments.fallback)
     visited = run.occupancy(arguments.episodes, arguments.seed)
     cells = histogram.count(visited.states, run.parts.grid, visited.weight)
     paths = analysis.paths(visited)
@@ -85,6 +97,18 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
             else {}
         ),
         **run.measures(visited, arguments.seed),
+        **({"gymnasium": _gap(run, arguments)} if arguments.gymnasium else {}),
+    }
+
+
+def _gap(run: "Run", arguments: Arguments) -> dict[str, Any]:
+    from maxent_jax import gymnasium_play
+
+    measured = gymnasium_play.gap(run, arguments.episodes, arguments.seed)
+    return {
+        "environment": gymnasium_play.IDS[run.config.env],
+        "sets_of_our_own": gymnasium_play.NUM_SETS,
+        "measures": {name: gap._asdict() for name, gap in measured.items()},
     }
 
 
@@ -101,6 +125,19 @@ def _print(report: dict[str, Any]) -> None:
     for name, value in report.items():
         if isinstance(value, int | float):
             print(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value:,}")
+    if "gymnasium" in report:
+        _print_gap(report["gymnasium"])
+
+
+def _print_gap(report: dict[str, Any]) -> None:
+    num_sets, environment = report["sets_of_our_own"], report["environment"]
+    print(f"in our simulator (mean of {num_sets} sets of episodes) and in {environment}:")
+    print(f"{'':29}ours  Gymnasium  difference  by chance")
+    for name, gap in report["measures"].items():
+        print(
+            f"{name:25}  {gap['ours']:6.4g}  {gap['gymnasium']:9.4g}"
+            f"  {gap['difference']:10.3g}  {gap['chance']:9.3g}"
+        )
 
 
 if __name__ == "__main__":

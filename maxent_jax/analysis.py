@@ -2,21 +2,36 @@
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.export import Exported
 
-from maxent_jax import checkpoint, methods, mixture, occupancy, parts, runs
+from maxent_jax import (
+    checkpoint,
+    dataset,
+    export,
+    integrity,
+    methods,
+    mixture,
+    occupancy,
+    parts,
+    runs,
+)
 from maxent_jax.config import Config
 from maxent_jax.density import histogram
 from maxent_jax.mixture import Archive
 from maxent_jax.occupancy import Occupancy, Scores
 from maxent_jax.parts import Parts
 from maxent_jax.sac import agent
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 class Paths(NamedTuple):
@@ -54,17 +69,31 @@ class Run:
         """The environment, the networks and the feature map of the run."""
         return parts.make(self.config)
 
+    def frame(self) -> "DataFrame":
+        """The metrics as a pandas frame: a row an iteration, a column a number.
+
+        A metric of more numbers has a column for each, `weights_0`, `weights_1`, ...
+
+        Raises:
+          ImportError: there is no pandas.
+        """
+        try:
+            from pandas import DataFrame
+        except ImportError:
+            raise ImportError("Run.frame needs pandas: pip install pandas.") from None
+        return DataFrame(_scalar_columns(self.metrics))
+
+    def features(self, states: jax.Array | np.ndarray) -> jax.Array:
+        """phi(s), where distances are taken: [..., D] -> [..., F]. `parts.phi.names` names them."""
+        return self.parts.phi(jnp.asarray(states))
+
     def policy(self, index: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
         """Policy `index` as a function: state [..., D], key -> action [..., A] in [-1, 1].
 
         Raises:
           IndexError: no such policy.
         """
-        if not -self.num_policies <= index < self.num_policies:
-            raise IndexError(f"policy {index} of a mixture of {self.num_policies}")
-        slot = jnp.asarray(index % self.num_policies)
-        actor = mixture.policy(self.mixture, slot).actor
-        return functools.partial(agent.act, self.parts.sac, actor)
+        return functools.partial(agent.act, self.parts.sac, self._actor(index))
 
     def act(self, s: jax.Array, key: jax.Array, policy: int | None = None) -> jax.Array:
         """Actions [..., A] for states [..., D] by one policy, drawn by weight unless named.
@@ -76,18 +105,45 @@ class Run:
             policy = int(jax.random.choice(key_draw, self.weights.shape[0], p=self.weights))
         return self.policy(policy)(s, key_act)
 
+    def export_policy(self, index: int, deterministic: bool = False) -> Exported:
+        """Policy `index` for use without this package: see export.policy for how it is called.
+
+        Raises:
+          IndexError: no such policy.
+        """
+        return export.policy(self.parts.sac, self._actor(index), deterministic)
+
     def occupancy(self, episodes_per_policy: int = 5, seed: int = 0) -> Occupancy:
         """Fresh episodes of each policy, with each state's share of the mixture's occupancy."""
         key_starts, key_play = jax.random.split(jax.random.key(seed))
         num_episodes = episodes_per_policy * self.num_policies
-        by_policy = parts.make(dataclasses.replace(self.config, pooled=False))
+        by_policy = self._parts_by_policy
         starts = jax.vmap(by_policy.env.reset)(jax.random.split(key_starts, num_episodes))
         weights = jnp.asarray(self.weights)
         return _of_mixture(by_policy, self.mixture, weights, starts, key_play)
 
+    def occupancy_of(self, episodes: Paths) -> Occupancy:
+        """The same of episodes that were played elsewhere, at least one of each policy."""
+        states = jnp.asarray(episodes.states).swapaxes(0, 1)
+        alive = jnp.asarray(episodes.alive).T
+        policy, none = jnp.asarray(episodes.policy, jnp.int32), jnp.zeros((), jnp.int32)
+        weights = jnp.asarray(self.weights)
+        return _of_episodes(self._parts_by_policy, weights, policy, states, alive, none)
+
     def rollout(self, episodes_per_policy: int = 5, seed: int = 0) -> Paths:
         """Fresh episodes of each policy, as paths."""
         return paths(self.occupancy(episodes_per_policy, seed))
+
+    def dataset(self, n: int, seed: int = 0) -> dict[str, np.ndarray]:
+        """`n` transitions of fresh episodes of the mixture, for offline reinforcement learning.
+
+        `np.savez_compressed(path, **run.dataset(n))` saves them. See dataset.collect for the keys.
+
+        Raises:
+          ValueError: n < 1.
+        """
+        weights, key = jnp.asarray(self.weights), jax.random.key(seed)
+        return dataset.collect(self.parts, self.mixture, weights, n, key)
 
     def scores(self, visited: Occupancy, seed: int = 0) -> Scores:
         """Each policy's return under the reward that these states of the mixture define."""
@@ -99,8 +155,19 @@ class Run:
         measured = occupancy.measures(self.parts, visited, jax.random.key(seed))
         return {name: value.item() for name, value in measured.items()}
 
+    @property
+    def _parts_by_policy(self) -> Parts:
+        """With which policies play equally often, and the states of each share its weight."""
+        return parts.make(dataclasses.replace(self.config, pooled=False))
+
+    def _actor(self, index: int) -> Any:
+        if not -self.num_policies <= index < self.num_policies:
+            raise IndexError(f"policy {index} of a mixture of {self.num_policies}")
+        return mixture.policy(self.mixture, jnp.asarray(index % self.num_policies)).actor
+
 
 _of_mixture = jax.jit(occupancy.of_mixture, static_argnums=0)
+_of_episodes = jax.jit(occupancy.of_episodes, static_argnums=0)
 _score = jax.jit(occupancy.score, static_argnums=0)
 
 
@@ -112,22 +179,27 @@ def paths(visited: Occupancy) -> Paths:
     return Paths(np.moveaxis(states, 0, 1), alive.T, np.asarray(visited.episode_policy))
 
 
-def load_run(path: str | Path, seed_index: int = 0) -> Run:
-    """Loads the results of a run; the replay stays on disk.
+def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> Run:
+    """Loads the results of a run as of its last checkpoint; the replay stays on disk.
 
     Args:
       path: the run's directory.
       seed_index: which of the seeds that were trained side by side.
+      fallback: pass over damaged checkpoints, with a warning for each.
     Raises:
       RunError: not the directory of a run, or no such seed.
       CheckpointError: no complete checkpoint.
+      CheckpointCorruptError: a file of it is not what was written.
     """
     directory = Path(path)
     config = runs.read_config(directory)
     if not 0 <= seed_index < config.num_seeds:
         raise runs.RunError(f"{directory} has {config.num_seeds} seeds: no index {seed_index}.")
-    results = checkpoint.restore_results(directory, config)
-    rows = runs.read_metrics(directory)
+    name, passed_over = integrity.find(directory, whole=False, fallback=fallback)
+    for sentence in passed_over.values():
+        warnings.warn(sentence, stacklevel=2)
+    results = checkpoint.restore_results(directory, name, config)
+    rows = checkpoint.read_progress(directory, name)[0].rows
     if config.num_seeds > 1:
         results = jax.tree.map(lambda x: x[seed_index], results)
         rows = [_of_seed(row, seed_index) for row in rows]
@@ -144,10 +216,35 @@ def load_run(path: str | Path, seed_index: int = 0) -> Run:
 
 def mean_ends(run: Run, episodes: Paths) -> np.ndarray:
     """[P, 2]: the mean of where the episodes of each policy end, on the grid's axes."""
+    ends = _located_ends(run, episodes)
+    return np.stack([ends[episodes.policy == i].mean(axis=0) for i in range(run.num_policies)])
+
+
+def mean_end_distances(run: Run, episodes: Paths) -> np.ndarray:
+    """[P]: how far from their first state the episodes of each policy end, on the grid's axes."""
+    distance = np.linalg.norm(
+        _located_ends(run, episodes) - _locate(run, episodes.states[:, 0]), axis=1
+    )
+    return np.stack([distance[episodes.policy == i].mean() for i in range(run.num_policies)])
+
+
+def _located_ends(run: Run, episodes: Paths) -> np.ndarray:
     last = episodes.alive.sum(axis=1) - 1
     ends = episodes.states[np.arange(len(last)), np.maximum(last, 0)]
-    ends = np.asarray(histogram.locate(ends, run.parts.grid))
-    return np.stack([ends[episodes.policy == i].mean(axis=0) for i in range(run.num_policies)])
+    return _locate(run, ends)
+
+
+def _locate(run: Run, states: np.ndarray) -> np.ndarray:
+    return np.asarray(histogram.locate(jnp.asarray(states), run.parts.grid))
+
+
+def _scalar_columns(metrics: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Metrics [T] as they are, and each entry of metrics [T, ...] by its name and indices."""
+    columns = {}
+    for name, values in metrics.items():
+        for index in np.ndindex(values.shape[1:]):
+            columns["_".join([name, *map(str, index)])] = values[:, *index]
+    return columns
 
 
 def _of_seed(row: dict[str, Any], index: int) -> dict[str, Any]:

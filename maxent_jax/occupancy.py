@@ -58,22 +58,42 @@ def of_mixture(
         offset = jnp.asarray(0.5)
     episode_policy = mixture.assign_episodes(plays, num_episodes, offset)
     reached = play(parts, archive, episode_policy, starts, key_act)
-    states = reached.states.reshape(-1, reached.states.shape[-1])
-    policy = jnp.broadcast_to(episode_policy, reached.alive.shape).reshape(-1)
-    alive = reached.alive.reshape(-1).astype(jnp.float32)
+    return of_episodes(
+        parts, weights, episode_policy, reached.states, reached.alive, reached.num_invalid
+    )
+
+
+def of_episodes(
+    parts: Parts,
+    weights: jax.Array,
+    episode_policy: jax.Array,
+    states: jax.Array,
+    alive: jax.Array,
+    num_invalid: jax.Array,
+) -> Occupancy:
+    """The states of episodes that were played, weighted as of_mixture says.
+
+    Args:
+      weights: [P].
+      episode_policy: [E] int32, who played each.
+      states, alive: [T, E, D] and [T, E] bool, as in Trajectories.
+    """
+    states = states.reshape(-1, states.shape[-1])
+    policy = jnp.broadcast_to(episode_policy, alive.shape).reshape(-1)
+    lives = alive.reshape(-1).astype(jnp.float32)
     if parts.config.pooled:
-        weight = alive
+        weight = lives
     else:
-        lived = jnp.zeros(weights.shape[0]).at[policy].add(alive)
-        weight = alive * (weights / jnp.maximum(lived, 1))[policy]
+        lived = jnp.zeros(weights.shape[0]).at[policy].add(lives)
+        weight = lives * (weights / jnp.maximum(lived, 1))[policy]
     return Occupancy(
         states=states,
         features=parts.phi(states),
         policy=policy,
         weight=weight / jnp.sum(weight),
-        alive=alive > 0,
+        alive=lives > 0,
         episode_policy=episode_policy,
-        num_invalid=reached.num_invalid,
+        num_invalid=num_invalid,
     )
 
 

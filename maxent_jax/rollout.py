@@ -11,10 +11,15 @@ from maxent_jax.envs.base import Env, State
 
 
 class Trajectories(NamedTuple):
-    """E episodes side by side. A state counts while `alive`: it was reached before the end."""
+    """E episodes side by side. A step counts while `alive`: its state was reached before the end.
+
+    A program that leaves a field unread does not keep it.
+    """
 
     states: jax.Array  # [T, E, D] the state reached by each step
+    actions: jax.Array  # [T, E, A] that led there, in [-1, 1]
     alive: jax.Array  # [T, E] bool
+    terminated: jax.Array  # [T, E] bool: the state ended its episode, as the environment says
     num_invalid: jax.Array  # [] int32, steps at which the physics left the finite numbers
 
 
@@ -35,16 +40,19 @@ def episodes(
 
     def step(carry, key_step):
         current, alive = carry
-        after = jax.vmap(env.step)(current, act(current.obs, key_step))
+        action = act(current.obs, key_step)
+        after = jax.vmap(env.step)(current, action)
         valid = base.finite_rows(after)
         reached = alive & valid
         states = jnp.where(valid[:, None], after.obs, current.obs)
         goes_on = reached & (after.done == 0)
         # An ended episode waits at its start: whatever became of its physics is never stepped.
         current = base.select_rows(goes_on, after, starts)
-        return (current, goes_on), (states, reached, jnp.sum(alive & ~valid, dtype=jnp.int32))
+        num_invalid = jnp.sum(alive & ~valid, dtype=jnp.int32)
+        found = Trajectories(states, action, reached, reached & ~goes_on, num_invalid)
+        return (current, goes_on), found
 
     everyone = jnp.ones(starts.done.shape[0], bool)
     keys = jax.random.split(key, episode_length)
-    _, (states, alive, invalid) = jax.lax.scan(step, (starts, everyone), keys)
-    return Trajectories(states, alive, jnp.sum(invalid))
+    _, found = jax.lax.scan(step, (starts, everyone), keys)
+    return found._replace(num_invalid=jnp.sum(found.num_invalid))

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from maxent_jax import runs
+from maxent_jax import integrity, runs
 from maxent_jax.config import ConfigError, preset
 from maxent_jax.devices import make_mesh
 
@@ -146,6 +146,18 @@ def test_two_processes_train_one_run_and_end_together(tmp_path):
         assert process.wait(timeout=240) == 0, (again / str(index)).read_text()
     assert [row["env_steps"] for row in runs.read_metrics(directory)] == [400, 800, 1200, 1600]
     assert (directory / "figures" / "curves.png").exists()
+
+
+def test_two_processes_stop_together_when_one_is_asked_to(tmp_path):
+    directory, logs = tmp_path / "run", tmp_path / "logs"
+    many = ("--num-iterations", "40", "--mixture-episodes", "41")
+    processes = start_two(directory, logs, *many)
+    deadline = time.time() + 120
+    while time.time() < deadline and not runs.read_metrics(directory):
+        time.sleep(0.1)
+    processes[1].send_signal(signal.SIGTERM)
+    assert [process.wait(timeout=60) for process in processes] == [143, 143]
+    assert integrity.find(directory)[0] == integrity.checkpoints(directory)[-1] != "40"
 
 
 @pytest.mark.parametrize(

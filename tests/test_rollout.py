@@ -71,6 +71,15 @@ def test_states_are_those_reached(burnt):
     assert np.isfinite(trajectories.states).all()
 
 
+def test_only_health_terminates_and_actions_are_those_taken(burnt):
+    lengths, trajectories = burnt
+    left = np.asarray(lengths) - np.arange(1, T + 1)[:, None]
+    # The fuse that steps over 0 and those that burn on are cut, not terminated.
+    np.testing.assert_array_equal(trajectories.terminated, left == 0)
+    assert trajectories.actions.shape == (T, len(lengths), 1)
+    assert (np.asarray(trajectories.actions)[np.asarray(trajectories.alive)] == 1).all()
+
+
 def test_the_policy_sees_the_state_and_a_new_key_each_step():
     def act(observation, key):
         return jnp.where(observation > 50, observation / 2, jax.random.uniform(key, (2, 1)))

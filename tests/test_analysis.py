@@ -1,0 +1,165 @@
+"""A run, loaded to be looked at: its columns, features, policies elsewhere, paths, the notebook."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import nbformat
+import numpy as np
+import pytest
+from nbclient import NotebookClient
+
+import maxent_jax
+from experiments import evaluate
+from maxent_jax import analysis, features, runs
+from maxent_jax.analysis import Paths
+from maxent_jax.config import ConfigError, preset
+
+ROOT = Path(__file__).parent.parent
+NOTEBOOK = ROOT / "docs" / "analysis.ipynb"
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory):
+    """Where the notebook looks for it, seen from a folder beside."""
+    path = tmp_path_factory.mktemp("work") / "runs" / "ant"
+    line = ("experiments.train", "--preset", "smoke", "--out", str(path))
+    subprocess.run([sys.executable, "-m", *line], cwd=ROOT, check=True, capture_output=True)
+    return path
+
+
+@pytest.fixture(scope="module")
+def run(directory):
+    return maxent_jax.load_run(directory)
+
+
+@pytest.fixture(scope="module")
+def visited(run):
+    return run.occupancy(episodes_per_policy=2, seed=3)
+
+
+def test_the_frame_has_a_column_for_each_number(run):
+    frame = run.frame()
+    assert len(frame) == 2 and frame["iteration"].tolist() == [1, 2]
+    np.testing.assert_array_equal(frame["mixture_coverage"], run.metrics["mixture_coverage"])
+    weights = frame[["weights_0", "weights_1", "weights_2"]]
+    np.testing.assert_array_equal(weights, run.metrics["weights"])
+    assert frame.shape[1] == sum(values[0].size for values in run.metrics.values())
+
+
+def test_a_metric_of_more_axes_is_named_by_its_indices(run):
+    cube = np.arange(12.0).reshape(2, 2, 3)
+    frame = dataclasses.replace(run, metrics={"cube": cube}).frame()
+    assert [*frame] == [f"cube_{i}_{j}" for i in range(2) for j in range(3)]
+    np.testing.assert_array_equal(frame["cube_1_2"], cube[:, 1, 2])
+
+
+def test_a_frame_without_pandas_is_one_sentence(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match="pip install pandas"):
+        run.frame()
+
+
+def test_features_are_the_environments(run, visited):
+    phi = features.make_feature_map("ant")
+    found = run.features(np.asarray(visited.states[:5]))
+    assert found.shape == (5, len(run.parts.phi.names)) == (5, 7)
+    np.testing.assert_array_equal(found, phi(visited.states[:5]))
+
+
+ELSEWHERE = """
+import sys
+from pathlib import Path
+import jax, numpy as np
+from jax import export
+policy = export.deserialize(Path(sys.argv[1], "policy").read_bytes())
+mean = export.deserialize(Path(sys.argv[1], "mean").read_bytes())
+states = np.load(Path(sys.argv[1], "states.npy"))
+drawn = [policy.call(states[:b], jax.random.key(7)) for b in (1, 3, 64)]
+np.savez(Path(sys.argv[1], "found"), *drawn, mean.call(states))
+assert not [name for name in sys.modules if name.startswith(("maxent_jax", "flax", "brax"))]
+"""
+
+
+def test_an_exported_policy_acts_without_this_package(run, visited, tmp_path):
+    states = np.asarray(visited.states[:64])
+    exported = run.export_policy(2)
+    assert set(exported.platforms) == {"cpu", "cuda", "tpu"}
+    (tmp_path / "policy").write_bytes(exported.serialize())
+    (tmp_path / "mean").write_bytes(run.export_policy(2, deterministic=True).serialize())
+    np.save(tmp_path / "states", states)
+    line = [sys.executable, "-W", "error", "-c", ELSEWHERE, str(tmp_path)]
+    subprocess.run(line, check=True, cwd=tmp_path)
+    found = [*np.load(tmp_path / "found.npz").values()]
+    for drawn in found[:-1]:
+        expected = run.policy(2)(states[: len(drawn)], jax.random.key(7))
+        # Compiled by itself: sums of 32 products may round in another order.
+        np.testing.assert_allclose(drawn, expected, atol=1e-5)
+    keys = jax.random.split(jax.random.key(8), 4000)
+    below = jax.vmap(lambda key: run.policy(2)(states, key) < found[-1])(keys).mean(0)
+    # Half of all draws lie below the action at the Gaussian's mean, whatever its spread; 5 standard
+    # deviations of 0.5 / sqrt(4000).
+    np.testing.assert_allclose(below, 0.5, atol=0.04)
+
+
+def test_no_such_policy_is_exported(run):
+    with pytest.raises(IndexError, match="policy 3 of a mixture of 3"):
+        run.export_policy(3)
+
+
+def test_the_occupancy_of_paths_is_that_which_they_came_from(run, visited):
+    again = run.occupancy_of(analysis.paths(visited))
+    for mine, theirs in zip(again, visited, strict=True):
+        # Compiled apart from the rollout: features and sums of weights round differently.
+        np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-6)
+
+
+def test_distances_of_ends_are_taken_from_each_start(run):
+    states = np.zeros((6, 100, 29), np.float32)
+    states[:, :, :2] = [1.0, -2.0]
+    states[:, 4, :2] = [[4, 2], [1, 3], [1, -2], [2, -2], [1, -2], [1, 10]]
+    alive = np.tile(np.arange(100) < 5, (6, 1))
+    distances = analysis.mean_end_distances(run, Paths(states, alive, np.repeat(range(3), 2)))
+    np.testing.assert_allclose(distances, [5, 0.5, 6])
+
+
+def test_evaluate_measures_the_gap_to_gymnasium(run, directory, capsys):
+    evaluate.main([str(directory), "--episodes", "1", "--gymnasium"])
+    printed = capsys.readouterr().out
+    report = json.loads((directory / "evaluation.json").read_text())["gymnasium"]
+    assert report["environment"] == "Ant-v4" and "in Ant-v4" in printed
+    distances = {f"policy_{i}_end_distance" for i in range(3)}
+    assert {"mixture_coverage", "evaluation_episode_length"} | distances <= {*report["measures"]}
+    for name, gap in report["measures"].items():
+        assert gap["gymnasium"] - gap["ours"] == pytest.approx(gap["difference"])
+        assert gap["chance"] >= 0 and name in printed
+
+
+def test_evaluate_says_where_gymnasium_has_no_such_environment(tmp_path):
+    runs.write_config(tmp_path, preset("smoke", env="pendulum"), {}, {})
+    with pytest.raises(ConfigError, match="pendulum is not played in Gymnasium"):
+        evaluate.main([str(tmp_path), "--gymnasium"])
+
+
+def test_the_notebook_runs(directory):
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    folder = directory.parent.parent / "docs"
+    folder.mkdir()
+    client = NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(folder)}})
+    client.execute()
+    assert not [o for o in outputs(notebook) if o.get("name") == "stderr" or "ename" in o]
+
+
+def test_the_notebook_shows_what_it_printed():
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in code] == [*range(1, len(code) + 1)]
+    assert sum("image/png" in o.get("data", {}) for o in outputs(notebook)) >= 3
+    assert NOTEBOOK.stat().st_size < 400_000
+
+
+def outputs(notebook):
+    return [o for cell in notebook.cells if cell.cell_type == "code" for o in cell.outputs]
