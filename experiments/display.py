@@ -1,13 +1,23 @@
-"""The progress line of training."""
+"""Progress on standard error, for terminals alone."""
 
 import time
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
+from rich import progress
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from maxent_jax.config import Config
+
+Item = TypeVar("Item")
+
+
+def track(items: Sequence[Item], what: str) -> Iterable[Item]:
+    """The items, with a progress line on standard error where that is a terminal."""
+    console = Console(stderr=True)
+    return progress.track(items, what, console=console, disable=not console.is_terminal)
 
 
 class Bar:

@@ -65,21 +65,7 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
     run = analysis.load_run(arguments.directory, arguments.seed_index, arguments.fallback)
     visited = run.occupancy(arguments.episodes, arguments.seed)
     cells = histogram.count(visited.states, run.parts.grid, visited.weight)
-    paths = analysis.paths(visited)
-    scores = run.scores(visited, arguments.seed)
-    plotting.save_all(run, np.asarray(cells), paths)
-    ends = analysis.mean_ends(run, paths)
-    policies = [
-        {
-            "policy": i,
-            "weight": float(run.weights[i]),
-            "episode_return": float(scores.episode_return[i]),
-            "step_reward": float(scores.step_reward[i]),
-            "episode_length": float(paths.alive[paths.policy == i].sum(1).mean()),
-            "mean_end": ends[i].tolist(),
-        }
-        for i in range(run.num_policies)
-    ]
+    plotting.save_all(run, np.asarray(cells), analysis.paths(visited))
     return {
         "run": str(run.path),
         "trained_with_seed": run.seed,
@@ -88,7 +74,7 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
         "reward": run.config.reward,
         "coordinates": run.parts.grid.names,
         "deviations_from_the_paper": run.config.deviations(),
-        "policies": policies,
+        "policies": [s._asdict() for s in run.summaries(visited, arguments.seed)],
         "training_coverage": int((run.histogram > 0).sum()),
         "training_entropy": float(histogram.shannon_entropy(jnp.asarray(run.histogram))),
         **(

@@ -42,6 +42,17 @@ class Paths(NamedTuple):
     policy: np.ndarray  # [E] int, ascending
 
 
+class Summary(NamedTuple):
+    """What a policy does in fresh episodes, under the reward that the mixture defines."""
+
+    policy: int
+    weight: float
+    episode_return: float
+    step_reward: float
+    episode_length: float  # mean, steps
+    mean_end: list[float]  # on the grid's axes
+
+
 @dataclasses.dataclass(frozen=True)
 class Run:
     """One seed of a run. `metrics` are columns with one entry an iteration, [T] or [T, ...]."""
@@ -149,6 +160,22 @@ class Run:
         """Each policy's return under the reward that these states of the mixture define."""
         rows = mixture.draw_rows(visited.weight, self.config.reference_size, jax.random.key(seed))
         return _score(self.parts, visited, visited.features[rows], rows, self.mixture)
+
+    def summaries(self, visited: Occupancy, seed: int = 0) -> list[Summary]:
+        """One for each policy, of the episodes in `visited`."""
+        episodes, scores, weights = paths(visited), self.scores(visited, seed), self.weights
+        ends = mean_ends(self, episodes)
+        return [
+            Summary(
+                policy=i,
+                weight=float(weights[i]),
+                episode_return=float(scores.episode_return[i]),
+                step_reward=float(scores.step_reward[i]),
+                episode_length=float(episodes.alive[episodes.policy == i].sum(1).mean()),
+                mean_end=ends[i].tolist(),
+            )
+            for i in range(self.num_policies)
+        ]
 
     def measures(self, visited: Occupancy, seed: int = 0) -> dict[str, float]:
         """Coverage and entropies of the mixture, named as in the metrics."""

@@ -1,21 +1,30 @@
 """The figures of a run: curves, the log-occupancy map (Fig. 5), and the paths of each policy."""
 
+import itertools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from maxent_jax.analysis import Paths, Run
 from maxent_jax.density import histogram
 from maxent_jax.density.histogram import Grid
-from maxent_jax.runs import FIGURES
+from maxent_jax.runs import FIGURES, whole_file
 
 COVERAGE_AXES = (
     ("iteration", "iteration"),
     ("env_steps", "thousand env steps"),
     ("wall_seconds", "wall-clock (s)"),
+)
+COMPARED = (
+    ("cumulative", "training", "-"),
+    ("mixture", "mixture", "--"),
+    ("random", "random policy", ":"),
 )
 NAMES = ("curves", "occupancy", "fireworks")
 AGENT, MIXTURE, RANDOM = "#1b6ca8", "#d1495b", "#7a7a7a"
@@ -24,31 +33,69 @@ AGENT, MIXTURE, RANDOM = "#1b6ca8", "#d1495b", "#7a7a7a"
 def curves(run: Run) -> Figure:
     """Coverage and entropy against iterations, env steps and wall-clock."""
     figure = Figure(figsize=(11, 6.4), layout="constrained")
-    axes = figure.subplots(2, 3, sharey="row")
     bins = run.parts.grid.bins
-    rows = (
-        ("coverage", f"visited cells of {bins[0] * bins[1]:,}"),
-        ("entropy", "histogram entropy (nats)"),
-    )
-    lines = (
+    axes = _axes_of_curves(figure, f"visited cells of {bins[0] * bins[1]:,}")
+    for prefix, name, color, style in (
         ("cumulative", "training, all states so far", AGENT, "-o"),
         ("mixture", "rollouts of the mixture", MIXTURE, "-s"),
         ("random", "random policy, as many steps", RANDOM, "--"),
-    )
-    for row, (quantity, label) in enumerate(rows):
-        for column, (axis, axis_label) in enumerate(COVERAGE_AXES):
-            ax = axes[row, column]
-            for prefix, name, color, style in lines:
-                values = run.metrics.get(f"{prefix}_{quantity}")
-                if values is not None:
-                    x = run.metrics[axis] / (1000 if axis == "env_steps" else 1)
-                    ax.plot(x, values, style, color=color, label=name, ms=4)
-            ax.set_xlabel(axis_label)
-            ax.grid(alpha=0.25)
-        axes[row, 0].set_ylabel(label)
-        axes[row, 0].set_ylim(bottom=0)
+    ):
+        _draw_curves(axes, run, prefix, style, color=color, label=name, ms=4)
+    _start_at_zero(axes)
     axes[1, 0].legend(frameon=False, fontsize=9, loc="lower right")
     return _finish(figure, run)
+
+
+def comparison(seeds: Mapping[str, Sequence[Run]]) -> Figure:
+    """The curves of several runs, one colour each, and of all their seeds.
+
+    Args:
+      seeds: the seeds of each run, by a name for the legend.
+    """
+    figure = Figure(figsize=(11, 6.8), layout="constrained")
+    axes = _axes_of_curves(figure, "visited cells")
+    styles = [Line2D([], [], color="black", ls=style, label=label) for _, label, style in COMPARED]
+    colors = []
+    for i, (name, runs) in enumerate(seeds.items()):
+        color = f"C{i % 10}"
+        for run, (prefix, _, style) in itertools.product(runs, COMPARED):
+            _draw_curves(axes, run, prefix, color=color, ls=style, marker=".", lw=1.2, ms=4)
+        colors.append(Line2D([], [], color=color, lw=4, label=name))
+    _start_at_zero(axes)
+    axes[1, 0].legend(handles=styles, frameon=False, fontsize=9, loc="lower right")
+    legend = figure.legend(handles=colors, frameon=False, fontsize=9, loc="outside lower center")
+    for text in legend.get_texts():
+        text.set_parse_math(False)  # a name may hold any sign
+    return figure
+
+
+def _axes_of_curves(figure: Figure, coverage_label: str) -> np.ndarray:
+    """[2, 3]: coverage and entropy, against each of the three axes."""
+    axes = figure.subplots(2, 3, sharey="row")
+    for column, (_, label) in enumerate(COVERAGE_AXES):
+        for ax in axes[:, column]:
+            ax.set_xlabel(label)
+            ax.grid(alpha=0.25)
+    for ax, label in zip(axes[:, 0], (coverage_label, "histogram entropy (nats)"), strict=True):
+        ax.set_ylabel(label)
+    return axes
+
+
+def _start_at_zero(axes: np.ndarray) -> None:
+    """Once all is drawn: it ends the automatic choice of the upper limit."""
+    for ax in axes[:, 0]:
+        ax.set_ylim(bottom=0)
+
+
+def _draw_curves(axes: np.ndarray, run: Run, prefix: str, *style: str, **options: Any) -> None:
+    """One line in each of the axes; none for what the run did not measure."""
+    for quantity, row in zip(("coverage", "entropy"), axes, strict=True):
+        values = run.metrics.get(f"{prefix}_{quantity}")
+        if values is None:
+            continue
+        for (axis, _), ax in zip(COVERAGE_AXES, row, strict=True):
+            x = run.metrics[axis] / (1000 if axis == "env_steps" else 1)
+            ax.plot(x, values, *style, **options)
 
 
 def occupancy_map(run: Run, mixture_cells: np.ndarray) -> Figure:
@@ -63,7 +110,8 @@ def occupancy_map(run: Run, mixture_cells: np.ndarray) -> Figure:
         ("rollouts of the mixture", mixture_cells),
     )
     shares = [np.log10(np.where(cells > 0, cells, np.nan)) for _, cells in panels]
-    low, high = min(np.nanmin(s) for s in shares), max(np.nanmax(s) for s in shares)
+    visited = np.concatenate([share[np.isfinite(share)] for share in shares])
+    low, high = (visited.min(), visited.max()) if visited.size else (None, None)
     for ax, (title, _), share in zip(figure.subplots(1, 2), panels, shares, strict=True):
         image = ax.imshow(
             share.T, origin="lower", extent=_extent(run), aspect="auto", vmin=low, vmax=high
@@ -78,14 +126,12 @@ def fireworks(run: Run, paths: Paths) -> Figure:
     """Where the episodes of each policy go, one colour for each policy."""
     figure = Figure(figsize=(7.4, 6.6), layout="constrained")
     ax = figure.subplots()
-    colors = matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, max(run.num_policies - 1, 1)))
+    colors = policy_colors(run.num_policies)
     for states, alive, policy in zip(*paths, strict=True):
         xy = np.asarray(histogram.locate(states[alive], run.parts.grid))
-        color = "black" if policy == 0 else colors[policy - 1]
-        ax.plot(*xy.T, color=color, lw=0.9, alpha=0.8)
-        ax.plot(*xy[-1:].T, "o", color=color, ms=3)
-    for policy in range(run.num_policies):
-        color = "black" if policy == 0 else colors[policy - 1]
+        ax.plot(*xy.T, color=colors[policy], lw=0.9, alpha=0.8)
+        ax.plot(*xy[-1:].T, "o", color=colors[policy], ms=3)
+    for policy, color in enumerate(colors):
         ax.plot([], [], color=color, label=f"π{policy}" + (" (untrained)" if policy == 0 else ""))
     _name_axes(ax, run)
     ax.set_title("paths of the archived policies; dots where they end")
@@ -104,6 +150,12 @@ def fireworks(run: Run, paths: Paths) -> Figure:
     return _finish(figure, run)
 
 
+def policy_colors(num_policies: int) -> np.ndarray:
+    """[P, 4] RGBA in [0, 1]: black for the untrained policy, then from blue to red."""
+    trained = matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, max(num_policies - 1, 1)))
+    return np.concatenate([[[0, 0, 0, 1]], trained])[:num_policies]
+
+
 def save_all(run: Run, mixture_cells: np.ndarray, paths: Paths) -> None:
     """The three figures, into the run's directory."""
     drawn = curves(run), occupancy_map(run, mixture_cells), fireworks(run, paths)
@@ -118,10 +170,10 @@ def all_saved(run_directory: Path) -> bool:
 
 def save(figure: Figure, directory: Path, name: str) -> Path:
     """Writes a figure as PNG, whole or not at all."""
-    directory.mkdir(parents=True, exist_ok=True)
-    path, temporary = directory / f"{name}.png", directory / f"{name}.tmp.png"
-    figure.savefig(temporary, dpi=110, bbox_inches="tight")
-    return temporary.replace(path)
+    path = directory / f"{name}.png"
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=110, bbox_inches="tight")
+    return path
 
 
 def _extent(run: Run) -> tuple[float, float, float, float]:

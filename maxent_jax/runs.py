@@ -153,8 +153,8 @@ def jsonable(value: Any) -> Any:
 
 
 @contextlib.contextmanager
-def writing(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Turns a full disk or a missing permission into one sentence, and leaves no temporary file.
+def writing(path: Path) -> Iterator[None]:
+    """Turns a full disk or a missing permission into one sentence.
 
     Raises:
       SaveError: what is done inside met an OSError.
@@ -162,11 +162,26 @@ def writing(path: Path, temporary: Path | None = None) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
         raise SaveError(
             f"cannot write {path}: {error.strerror or error}; what was saved before is intact."
         ) from error
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A temporary file to write to, which takes the path's place once all went well.
+
+    Raises:
+      SaveError: it cannot be written.
+    """
+    temporary = path.with_suffix(f".tmp{path.suffix}")
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield temporary
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 def _lines(rows: list[dict[str, Any]]) -> str:
@@ -174,7 +189,5 @@ def _lines(rows: list[dict[str, Any]]) -> str:
 
 
 def _replace(path: Path, text: str) -> None:
-    temporary = path.with_suffix(path.suffix + ".tmp")
-    with writing(path, temporary):
+    with whole_file(path) as temporary:
         temporary.write_text(text)
-        os.replace(temporary, path)

@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "maxent_jax"
 # The reading order of the package, first to last.
 ORDER = [
-    *("types", "config", "convergence", "runs", "runtime", "native"),
+    *("types", "config", "convergence", "runs", "integrity", "headless", "runtime", "native"),
     *("density.histogram", "density.knn", "density.sharding"),
     *("density.entropy", "density.reservoir"),
     *("envs.physics", "envs.mjx_backend", "envs.mujoco_backend", "envs.torso", "envs.task"),
@@ -18,7 +18,8 @@ ORDER = [
     *("envs", "envs.base", "rollout", "features"),
     *("rewards", "sac.networks", "sac.replay", "sac.losses", "sac.agent", "mixture", "methods"),
     *("parts", "occupancy", "experience", "training", "algorithm"),
-    *("devices", "checkpoint", "analysis", "plotting"),
+    *("devices", "checkpoint", "dataset", "export", "analysis", "gymnasium_play", "plotting"),
+    *("rendering", "film"),
 ]
 
 
@@ -51,7 +52,7 @@ def test_every_module_has_its_place_in_the_order():
 
 def test_the_command_line_is_checked_without_jax():
     code = (
-        "import sys; from experiments import train, evaluate\n"
+        "import sys; from experiments import train, evaluate, render, report\n"
         "train.read_arguments(['--preset', 'smoke', '--out', 'nowhere'])\n"
         "sys.exit('jax' in sys.modules)"
     )

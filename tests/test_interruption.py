@@ -5,7 +5,7 @@ import subprocess
 import sys
 import time
 
-# The main thread sleeps in C, where no handler of Python's runs; a signal ends the first of its naps.
+# The main thread naps in C, where no handler of Python's runs; a signal ends the first nap alone.
 BUSY = """
 import ctypes, sys
 from experiments.interruption import Interruption

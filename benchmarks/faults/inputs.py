@@ -77,6 +77,18 @@ MISTAKES = (
     Mistake("experiments.evaluate", "{missing}", "not the directory of a run"),
     Mistake("experiments.evaluate", "{run} --episodes 0", "at least 1"),
     Mistake("experiments.evaluate", "{newer}", "schema 99"),
+    Mistake("experiments.evaluate", "{pendulum} --gymnasium", "not played in Gymnasium"),
+    Mistake("experiments.render", "{missing}", "not the directory of a run"),
+    Mistake("experiments.render", "{pendulum}", "cannot be drawn"),
+    Mistake("experiments.render", "{run} --size 3", "--size must be"),
+    Mistake("experiments.render", "{run} --policy 9", "the run has policies 0 to 2"),
+    Mistake("experiments.render", "{run}", "maxent_jax[render]", without="imageio_ffmpeg"),
+    Mistake(
+        "experiments.render", "{run}", "MUJOCO_GL is 'gles'", environment=("MUJOCO_GL", "gles")
+    ),
+    Mistake("experiments.report", "", "name the directory"),
+    Mistake("experiments.report", "{run} {run}", "named twice"),
+    Mistake("experiments.report", "{run} --out {missing}/page.html", "cannot write"),
     Mistake("experiments.verify", "{empty}", "not the directory of a run"),
     Mistake("experiments.verify", "{run}", "no complete checkpoint"),
     Mistake("experiments.verify", "", "directory"),
@@ -102,12 +114,14 @@ def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
 
 def _places(folder: Path) -> dict[str, Path]:
     """Directories, by what is wrong with them."""
-    places = {name: folder / name for name in ("missing", "empty", "foreign", "newer", "run")}
-    for name in ("empty", "foreign", "newer", "run"):
+    names = ("missing", "empty", "foreign", "newer", "run", "pendulum")
+    places = {name: folder / name for name in names}
+    for name in names[1:]:
         places[name].mkdir()
     (places["foreign"] / "thesis.tex").write_text("")
     (places["newer"] / runs.CONFIG).write_text(json.dumps({"schema": 99, "config": {}}))
     runs.write_config(places["run"], preset("smoke"), {}, {})
+    runs.write_config(places["pendulum"], preset("smoke", env="pendulum"), {}, {})
     places["file"] = folder / "file"
     places["file"].write_text("")
     return places

@@ -1,0 +1,180 @@
+"""The tables of a report: numbers of runs as text."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from maxent_jax import plotting
+from maxent_jax.analysis import Run
+from maxent_jax.config import Config
+from maxent_jax.occupancy import Occupancy
+
+MISSING = "–"
+METRICS = (  # name, head, format
+    ("env_steps", "env steps", ",.0f"),
+    ("gradient_steps", "gradient steps", ",.0f"),
+    ("wall_seconds", "seconds", ",.0f"),
+    ("cumulative_coverage", "cells, training", ",.0f"),
+    ("random_coverage", "cells, random", ",.0f"),
+    ("mixture_coverage", "cells, mixture", ",.0f"),
+    ("cumulative_entropy", "entropy, training", ".2f"),
+    ("random_entropy", "entropy, random", ".2f"),
+    ("mixture_entropy", "entropy, mixture", ".2f"),
+)
+SECONDS = (
+    ("wall_begin", "of rollouts for the reward", np.sum),
+    ("wall_train", "of training", np.sum),
+    ("wall_end", "of evaluation", np.sum),
+    ("wall_first_step", "to the end of the first segment", np.max),
+    ("wall_seconds", "in all", np.max),
+)
+
+
+class Table(NamedTuple):
+    """A table of text. Where there are colours, one for each row marks it."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    colors: Sequence[str] = ()
+
+
+def number(value: Any, how: str) -> str:
+    """A number as text, MISSING for one that is not finite or no number."""
+    try:
+        value = float(value)
+    except (TypeError, ValueError):
+        return MISSING
+    return format(value, how) if math.isfinite(value) else MISSING
+
+
+def last(run: Run, name: str) -> Any:
+    """A metric after the last complete iteration; None where there is none."""
+    column = run.metrics.get(name)
+    return None if column is None or not len(column) else column[-1]
+
+
+def headline(seeds: Sequence[Run]) -> dict[str, Any]:
+    """A sentence about a run, and its figures: means over the seeds."""
+    first = seeds[0]
+    bins = first.parts.grid.bins
+    cells = f"of {bins[0] * bins[1]:,}"
+    trained = f"{first.num_policies - 1} of {first.config.num_iterations} policies trained"
+    kind = "1 seed" if len(seeds) == 1 else f"{len(seeds)} seeds, of which these are the means"
+    tiles = (
+        ("cells, training", "cumulative_coverage", ",.0f", cells),
+        ("cells, random", "random_coverage", ",.0f", cells),
+        ("cells, mixture", "mixture_coverage", ",.0f", cells),
+        ("entropy, training", "cumulative_entropy", ".2f", "nats"),
+        ("entropy, mixture", "mixture_entropy", ".2f", "nats"),
+        ("env steps", "env_steps", ",.0f", "for each seed" if len(seeds) > 1 else "of training"),
+        ("wall-clock", "wall_seconds", ",.0f", "seconds"),
+    )
+    return {
+        "sentence": f"{trained} · {kind}",
+        "tiles": [
+            {"what": what, "value": number(_mean_last(seeds, name), how), "beside": beside}
+            for what, name, how, beside in tiles
+        ],
+    }
+
+
+def _mean_last(seeds: Sequence[Run], name: str) -> float | None:
+    values = [last(run, name) for run in seeds]
+    return None if None in values else float(np.mean(values))
+
+
+def results(seeds: Mapping[str, Sequence[Run]]) -> Table:
+    """One row for each run and seed, after its last complete iteration."""
+    rows = [
+        [
+            name,
+            f"MaxEnt-{run.config.method.upper()}, {run.config.env}, {run.config.preset}",
+            str(run.seed),
+            f"{len(run.metrics.get('iteration', ()))} of {run.config.num_iterations}",
+            *(number(last(run, metric), how) for metric, _, how in METRICS),
+        ]
+        for name, of_run in seeds.items()
+        for run in of_run
+    ]
+    head = ["run", "method, environment, preset", "seed", "iterations"]
+    return Table([*head, *(text for _, text, _ in METRICS)], rows)
+
+
+def iterations(run: Run) -> Table:
+    """One row for each complete iteration."""
+    measured = [metric for metric in METRICS if metric[0] in run.metrics]
+    rows = [
+        [str(i + 1), *(number(run.metrics[name][i], how) for name, _, how in measured)]
+        for i in range(len(run.metrics.get("iteration", ())))
+    ]
+    return Table(["iteration", *(text for _, text, _ in measured)], rows)
+
+
+def policies(run: Run, visited: Occupancy, seed: int) -> Table:
+    """What each policy does in fresh episodes."""
+    where = ", ".join(run.parts.grid.names)
+    rows = [
+        [
+            f"π{summary.policy}" + (" (untrained)" if summary.policy == 0 else ""),
+            number(summary.weight, ".3f"),
+            number(summary.episode_return, ",.1f"),
+            number(summary.step_reward, ".3f"),
+            number(summary.episode_length, ",.0f"),
+            ", ".join(number(end, ".1f") for end in summary.mean_end),
+        ]
+        for summary in run.summaries(visited, seed)
+    ]
+    head = ["policy", "weight", "return", "reward a step", "steps an episode"]
+    colors = [
+        f"rgb({r * 255:.0f} {g * 255:.0f} {b * 255:.0f})"
+        for r, g, b, _ in plotting.policy_colors(run.num_policies)
+    ]
+    return Table([*head, f"mean end: {where}"], rows, colors)
+
+
+def measures(measured: Mapping[str, float]) -> Table:
+    """What the mixture covers in fresh episodes."""
+    named = (
+        ("mixture_coverage", "visited cells", ",.0f"),
+        ("mixture_entropy", "entropy of the cells, nats", ".2f"),
+        ("mixture_knn_entropy", "entropy of the features, nats", ".2f"),
+        ("mixture_off_grid_share", "share of it off the grid", ".1%"),
+        ("evaluation_episode_length", "steps an episode", ",.0f"),
+    )
+    return Table([], [[what, number(measured.get(name), how)] for name, what, how in named])
+
+
+def budget(run: Run, planned: Any) -> Table:
+    """Steps planned, as config.json has them, and done; and where the time went."""
+    planned = planned if isinstance(planned, dict) else {}
+    rows = [
+        [what, number(planned.get(name), ",.0f"), number(last(run, name), ",.0f")]
+        for name, what in (("env_steps", "env steps"), ("gradient_steps", "gradient steps"))
+    ]
+    rows += [
+        ["policies, the untrained one too", str(run.config.archive_size), str(run.num_policies)],
+        ["env steps of the mixture's rollouts", "", _reduced(run, "num_rollout_steps", np.sum)],
+        ["steps that left the finite numbers", "", _reduced(run, "num_invalid", np.sum)],
+    ]
+    rows += [[f"seconds {what}", "", _reduced(run, name, how)] for name, what, how in SECONDS]
+    rows.append(["peak memory of the device, bytes", "", _reduced(run, "wall_peak_bytes", np.max)])
+    return Table(["", "planned", "done"], rows)
+
+
+def _reduced(run: Run, name: str, how: Callable[[np.ndarray], Any]) -> str:
+    values = run.metrics.get(name, np.empty(0))
+    return number(how(values), ",.0f") if len(values) else MISSING
+
+
+def departures(config: Config) -> Table:
+    """What the run does otherwise than the paper, and why it says so."""
+    rows = [[name, str(getattr(config, name)), why] for name, why in config.deviations().items()]
+    return Table(["setting", "value", "what it means"], rows)
+
+
+def pairs(content: Any) -> Table:
+    """The entries of a dictionary; none for anything else."""
+    entries = content.items() if isinstance(content, dict) else ()
+    return Table([], [[str(key), str(value)] for key, value in entries])
