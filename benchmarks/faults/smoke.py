@@ -12,7 +12,7 @@ import numpy as np
 from maxent_jax import checkpoint, integrity, runs
 
 # Saved at every boundary, so that a fault may meet a checkpoint as well as the work between two.
-SMOKE = ("--preset", "smoke", "--env", "pendulum", "--save-minutes", "1e-9")
+SMOKE = ("--preset", "smoke", "--save-minutes", "1e-9")
 
 
 def command(directory: Path, *flags: str) -> list[str]:
