@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import optimize
 
 from maxent_jax.sac.agent import Parameters
 
@@ -60,6 +61,45 @@ def geometric_weights(n: int, eta: float) -> np.ndarray:
     if not 0 < eta <= 1:
         raise ValueError(f"eta is {eta}, but must be in (0, 1]")
     return project_to_simplex((1 - eta) ** (n - np.arange(n, dtype=np.float64)))
+
+
+def fully_corrective_weights(
+    occupancies: np.ndarray, smoothing: float, start: np.ndarray | None = None
+) -> np.ndarray:
+    """The weights whose mixture has the largest smoothed entropy -Σ d(s) log(d(s) + σ).
+
+    A concave problem on the simplex, solved by SciPy's SLSQP.
+
+    Args:
+      occupancies: [n, S] of each policy, of sum 1.
+      smoothing: σ > 0.
+      start: [n] weights to begin with; equal ones if left out.
+    Returns:
+      [n] float64, at least 0, of sum 1.
+    Raises:
+      ValueError: no policies, or σ <= 0.
+    """
+    n = len(occupancies)
+    _check_count(n)
+    if not 0 < smoothing < np.inf:
+        raise ValueError(f"smoothing is {smoothing}, but must be a positive number")
+
+    def loss(weights):
+        mixed = weights @ occupancies
+        shared = np.log(mixed + smoothing)
+        return mixed @ shared, occupancies @ (shared + mixed / (mixed + smoothing))
+
+    solved = optimize.minimize(
+        loss,
+        uniform_weights(n) if start is None else start,
+        jac=True,
+        bounds=[(0, 1)] * n,
+        constraints={"type": "eq", "fun": lambda x: x.sum() - 1, "jac": np.ones_like},
+        method="SLSQP",
+        options={"ftol": 1e-15, "maxiter": 1000},
+    )
+    weights = np.maximum(solved.x, 0)
+    return weights / weights.sum()
 
 
 def project_to_simplex(values: np.ndarray) -> np.ndarray:

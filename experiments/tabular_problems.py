@@ -1,0 +1,177 @@
+"""The MDPs of experiments.theory, what is known of each, and how a run is held against it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import cli
+from maxent_jax import methods
+from maxent_jax.theory import bounds, loop, mdps, optimum, tabular
+from maxent_jax.theory.mdps import Dynamics, Mdp
+
+FIT_FROM = 10  # iterations: where the rate is fitted from
+
+
+class Problem(NamedTuple):
+    """An MDP for each of N seeds, with the optimum, the bounds' constants and first policies."""
+
+    name: str
+    mdps: list[Mdp]  # one for all seeds, or one for each
+    smoothing: float
+    best: list[optimum.Optimum]  # as many
+    first: np.ndarray  # [N, L, S, A]
+    keys: jax.Array  # [N]
+
+    @property
+    def num_states(self) -> int:
+        """|S|."""
+        return len(self.mdps[0].start)
+
+    @property
+    def constants(self) -> tuple[float, float]:
+        """B and β of the smoothed entropy, computed."""
+        return (
+            bounds.objective_range(self.num_states, self.smoothing),
+            bounds.smoothness(self.smoothing),
+        )
+
+    @property
+    def mdp(self) -> Mdp:
+        """In the form that `loop.run` takes."""
+        return self.mdps[0] if len(self.mdps) == 1 else mdps.stack(self.mdps)
+
+    @property
+    def objective(self) -> np.ndarray:
+        """[N] the largest H_σ, nats."""
+        each = [found.objective for found in self.best]
+        return np.array(each * (len(self.first) // len(each)))
+
+    @property
+    def optimal_occupancy(self) -> np.ndarray:
+        """[N, S]."""
+        each = [found.occupancy for found in self.best]
+        return np.array(each * (len(self.first) // len(each)))
+
+    def reward_at_optimum(self) -> np.ndarray:
+        """[N, S] the gradient of H_σ there: what each state is worth to the optimum."""
+        with tabular.float64():
+            return np.asarray(tabular.gradient(jnp.asarray(self.optimal_occupancy), self.smoothing))
+
+    @property
+    def converged(self) -> int:
+        """Planning steps until values have converged."""
+        return tabular.converged_steps(self.mdps[0])
+
+    def seeds(self, number: int) -> "Problem":
+        """With the first so many seeds."""
+        some = slice(None, number)
+        kept = slice(None, number if len(self.mdps) > 1 else None)
+        return self._replace(
+            mdps=self.mdps[kept], best=self.best[kept], first=self.first[some], keys=self.keys[some]
+        )
+
+
+def make(
+    name: str, of_seeds: Sequence[Mdp], num_seeds: int, seed: int, tolerance: float
+) -> Problem:
+    """With σ = 1/|S|, so that β = 2|S|, and first policies drawn at random.
+
+    Raises:
+      UsageError: no solution within the tolerance.
+    """
+    smoothing = 1 / len(of_seeds[0].start)
+    try:
+        best = [optimum.solve(mdp, smoothing, tolerance) for mdp in of_seeds]
+    except optimum.OptimumError as missed:
+        raise cli.UsageError(f"{name}: {missed}: take a larger --tolerance.") from None
+    keys = jax.random.split(jax.random.key(seed), num_seeds)
+    with tabular.float64():
+        device = tabular.on_device(of_seeds[0])
+        draw = jax.jit(jax.vmap(lambda key: tabular.random_policy(device, key)))
+        first = np.asarray(draw(keys))
+    return Problem(name, list(of_seeds), smoothing, best, first, keys)
+
+
+def known(num_seeds: int, discount: float, toy: bool) -> dict[str, list[Mdp]]:
+    """MDPs by name, one for all seeds; of Garnet one for each."""
+    length, horizon, states = (7, 6, 8) if toy else (31, 20, 20)
+    garnets = [mdps.garnet(states, 4, 3, seed) for seed in range(num_seeds)]
+    discounted = {"river swim": [mdps.river_swim()], "Garnet": garnets}
+    if not toy:
+        discounted |= {
+            "four rooms": [mdps.four_rooms()],
+            "small rooms": [mdps.four_rooms(11)],
+            "open grid": [mdps.open_grid()],
+        }
+    return {
+        "double chain": [mdps.finite_horizon(mdps.double_chain(length), horizon)],
+        **{
+            name: [mdps.discounted(dynamics, discount) for dynamics in of_seeds]
+            for name, of_seeds in discounted.items()
+        },
+    }
+
+
+def read(path: Path, discount: float) -> Mdp:
+    """A user's own MDP: an .npz with `transitions` [S, A, S] and `start` [S].
+
+    Raises:
+      UsageError: no such file, or no MDP in it.
+    """
+    try:
+        with np.load(path) as file:
+            return mdps.discounted(Dynamics(file["transitions"], file["start"]), discount)
+    except (OSError, KeyError, ValueError) as mistake:
+        raise cli.UsageError(f"--mdp {path} holds no MDP: {str(mistake).strip(chr(39))}.") from None
+
+
+def run(problem: Problem, row: methods.Row, iterations: int, **options: Any) -> loop.Trace:
+    """The method on the problem, with planning to convergence unless said otherwise."""
+    settings = loop.Settings(
+        **({"planning_steps": problem.converged} | options),
+        num_iterations=iterations,
+        smoothing=problem.smoothing,
+    )
+    return loop.run(problem.mdp, row, settings, problem.first, problem.keys)
+
+
+def gaps(problem: Problem, objective: np.ndarray) -> np.ndarray:
+    """[N, P] nats below the optimum."""
+    return problem.objective[:, None] - objective
+
+
+def checkpoints(iterations: int) -> np.ndarray:
+    """Iterations at which curves are kept: equally spaced in their logarithm."""
+    return np.unique(np.geomspace(1, iterations, 40).round().astype(int))
+
+
+def veritas_bounds(
+    problem: Problem, trace: loop.Trace, times: np.ndarray, form: str = "tight"
+) -> np.ndarray:
+    """[N, C] Theorem 1 after so many iterations, with the errors that the run made."""
+    of_range, beta = problem.constants
+    return np.array(
+        [
+            [
+                # The mixture after n iterations is that of Theorem 1 for T = n - 1.
+                bounds.veritas_epsilon(n - 1, of_range, beta, density[:n], planning[:n], form)
+                for n in times
+            ]
+            for density, planning in zip(
+                trace.density_error.tolist(), trace.planning_error.tolist(), strict=True
+            )
+        ]
+    )
+
+
+def hazan_bounds(problem: Problem, trace: loop.Trace, times: np.ndarray, eta: float) -> np.ndarray:
+    """[N, C] the bound of MaxEnt-H after so many iterations."""
+    of_range, beta = problem.constants
+    errors = zip(trace.density_error.max(1), trace.planning_error.max(1), strict=True)
+    return np.array(
+        [[bounds.hazan_epsilon(n, of_range, beta, eta, *worst) for n in times] for worst in errors]
+    )

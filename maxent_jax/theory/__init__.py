@@ -1,0 +1,1 @@
+"""The theory, executable: bounds, and exact experiments in tabular MDPs."""
