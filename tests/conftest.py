@@ -16,3 +16,10 @@ jax.config.update("jax_legacy_prng_key", "error")
 @pytest.fixture
 def key():
     return jax.random.key(0)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs():
+    """Each program on a CPU holds memory maps, of which a process may have 65,530 (Linux)."""
+    yield
+    jax.clear_caches()
