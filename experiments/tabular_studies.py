@@ -1,5 +1,6 @@
 """The studies of experiments.theory: each takes problems and returns figures, JSON-ready."""
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -42,7 +43,9 @@ def bound_table() -> list[dict[str, Any]]:
 
 def rate(problem: Problem, iterations: int) -> dict[str, Any]:
     """How fast V's gap falls, against Theorem 1, and what is left at the end."""
+    started = time.perf_counter()
     trace = problems.run(problem, V, iterations)
+    seconds = time.perf_counter() - started
     gap = problems.gaps(problem, trace.objective)
     times = problems.checkpoints(iterations)
     bound = problems.veritas_bounds(problem, trace, times)
@@ -66,6 +69,7 @@ def rate(problem: Problem, iterations: int) -> dict[str, Any]:
         ),
         **_slope(gap),
         **_parts(problem, trace, gap[:, -1]),
+        "wall_seconds": seconds,
     }
 
 
@@ -151,13 +155,15 @@ def refresh(problem: Problem, budget: int) -> dict[str, Any]:
         series["LA, history"].append(problems.gaps(problem, trace.history_objective)[:, -1])
     found["gap"] = {name: np.array(gap) for name, gap in series.items()}  # [periods, N]
     middle = {name: np.median(gap, axis=1) for name, gap in found["gap"].items()}
-    iteration = periods.index(min(ARCHIVED_EVERY, periods[-1]))
-    for name in ("LA", "LA, history"):
-        # Against V whose iteration has as many planning steps as LA's.
-        better = middle[name][: iteration + 1] < middle["V"][iteration]
-        found[f"{name}, better until"] = (
-            periods[int(np.flatnonzero(better)[-1])] if better.any() else 0
+    # Against V whose iterations have as many planning steps as LA's.
+    same = periods.index(min(ARCHIVED_EVERY, periods[-1]))
+    found["better_until"] = {
+        name: max(
+            (p for p, gap in zip(periods, middle[name], strict=True) if gap < middle["V"][same]),
+            default=0,
         )
+        for name in ("LA", "LA, history")
+    }
     return found
 
 
@@ -184,9 +190,11 @@ def noise(problem: Problem, iterations: int) -> list[dict[str, Any]]:
     return rows
 
 
-def lost(num_seeds: int, seed: int, tolerance: float, iterations: int) -> dict[str, Any]:
+def lost(
+    length: int, num_seeds: int, seed: int, tolerance: float, iterations: int
+) -> dict[str, Any]:
     """Where V loses: one policy is all but optimal, and uniform weights never forget the first."""
-    mdp = mdps.discounted(mdps.river_swim(20), 0.9)
+    mdp = mdps.discounted(mdps.river_swim(length), 0.9)
     problem = problems.make("long river swim", [mdp], num_seeds, seed, tolerance)
     found = compare(problem, iterations)["methods"]
     with tabular.float64():

@@ -102,7 +102,9 @@ def study(arguments: Arguments) -> dict[str, Any]:
         "refresh": {name: studies.refresh(few[name], budget) for name in track(plain, "refresh")},
         "noise": {"on": noisy, "rows": studies.noise(few[noisy], T)},
         "game": {"on": played, "gap": studies.game(few[played], T, arguments.tolerance)},
-        "lost": studies.lost(arguments.few_seeds, arguments.seed, arguments.tolerance, T),
+        "lost": studies.lost(
+            6 if arguments.toy else 20, arguments.few_seeds, arguments.seed, arguments.tolerance, T
+        ),
         "proposition_1": studies.proposition_1(TOY_SAMPLES if arguments.toy else SAMPLES),
     }
     return results | {"wall_seconds": time.perf_counter() - started}
@@ -159,6 +161,7 @@ def _print(results: Mapping[str, Any]) -> None:
         print(f"  {'':14}" + "".join(f"{period:9d}" for period in found["periods"]))
         for series, gap in found["gap"].items():
             print(f"  {series:14}" + "".join(f"{statistics.median(g):9.1e}" for g in gap))
+        print(f"  better than V with LA's iterations up to a period of: {found['better_until']}")
     print(f"{results['noise']['on']}, V: ε₀, ε₁, gap, Theorem 1")
     for row in results["noise"]["rows"]:
         print("  " + "  ".join(f"{row[key]:8.3g}" for key in list(row)[:4]))

@@ -72,6 +72,28 @@ def test_discounted_occupancy_of_two_states_in_closed_form(p, q, start, discount
     np.testing.assert_allclose(found, [1 - second, second], rtol=0, atol=1e-15 / (1 - discount))
 
 
+WIDE = mdps.garnet(12, 2, tabular.UNROLLED + 1, seed=3)  # more successors than are written out
+LARGE = mdps.four_rooms(13)  # more states than are solved for
+
+
+@pytest.mark.parametrize("dynamics", [SMALL, WIDE, LARGE], ids=["small", "wide", "large"])
+def test_what_the_greedy_policy_visits_follows_from_the_chain_that_it_makes(dynamics):
+    discount, states = 0.9, len(dynamics.start)
+    mdp = mdps.discounted(dynamics, discount)
+    reward, values = np.random.default_rng(0).normal(size=(2, states))
+    action_values = reward[:, None] + discount * dynamics.transitions @ values
+    chain = dynamics.transitions[np.arange(states), action_values.argmax(1)]
+    moves = np.eye(states) - discount * chain
+    expected = (1 - discount) * np.linalg.solve(moves.T, dynamics.start)
+    with tabular.float64():
+        device, given = tabular.on_device(mdp), (jnp.asarray(reward), jnp.asarray(values)[None])
+        policy = tabular.greedy(tabular.action_values(device, *given))
+        found = np.asarray(jax.jit(tabular.greedy_occupancy)(device, *given))
+    # Derived: what is left of the flow, 1e-14, grown by 1/(1 - γ).
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(occupancy(mdp, policy), expected, rtol=0, atol=1e-13)
+
+
 @pytest.mark.parametrize("horizon", [1, 2, 17])
 def test_finite_occupancy_of_two_states_in_closed_form(horizon):
     p, q = 0.3, 0.2

@@ -134,6 +134,13 @@ def test_a_refresh_period_is_a_number_of_planning_steps():
     assert np.abs(at_each - once).max() > 1e-3
 
 
+def test_policies_that_depend_on_time_come_near_the_optimum_too():
+    mdp = mdps.finite_horizon(mdps.double_chain(7), 6)
+    gap = optimum.solve(mdp, 1 / 7).objective - run(V, iterations=60, steps=6, mdp=mdp).objective
+    assert (gap > -1e-8).all()
+    assert (gap[:, -1] < 0.02 * gap[:, 0]).all()
+
+
 def test_seeds_and_mdps_side_by_side_change_nothing():
     some = [mdps.discounted(mdps.garnet(8, 3, 2, seed), DISCOUNT) for seed in (5, 2)]
     stacked, alone = run(V, mdp=MDP), []
@@ -301,7 +308,7 @@ def test_bad_input_is_one_sentence(call, sentence):
 def test_the_entry_point_at_toy_size(tmp_path, capsys):
     theory.main(["--toy", "--out", str(tmp_path / "results" / "theory.json")])
     results = json.loads((tmp_path / "results" / "theory.json").read_text())
-    assert set(results["rates"]) == {"river swim", "Garnet", "double chain"}
+    assert set(results["rates"]) == {"river swim", "Garnet"}
     for name, found in results["rates"].items():
         assert found["duality_gap"] <= 1e-8
         assert 0 < found["largest_share_of_bound"] < 1

@@ -219,25 +219,21 @@ def _train(mdp, numbers, shape, agent, refreshed):
 
 def _visit(mdp, agent):
     """With what its policy does added to the history."""
-    change = (_greedy_occupancy(mdp, agent.reward, agent.values) - agent.history) / (agent.age + 1)
+    occupied = tabular.greedy_occupancy(mdp, agent.reward, agent.values)
+    change = (occupied - agent.history) / (agent.age + 1)
     return agent._replace(history=agent.history + change, age=agent.age + 1)
 
 
 def _next_occupancy(mdp, numbers, shape, agent):
     """The occupancy to archive, and a bound of the value that it loses under the last reward."""
-    best = _greedy_occupancy(mdp, agent.reward, agent.values)
+    best = tabular.greedy_occupancy(mdp, agent.reward, agent.values)
     lost = tabular.planning_loss(mdp, agent.reward, agent.values)
     if not shape.plans_badly:
         return best, lost
     opposite = tabular.plan(mdp, -agent.reward, jnp.zeros_like(agent.values), shape.planning_steps)
-    worst = _greedy_occupancy(mdp, -agent.reward, opposite)
+    worst = tabular.greedy_occupancy(mdp, -agent.reward, opposite)
     share = jnp.minimum(numbers.planning_noise / ((best - worst) @ agent.reward), 1)
     return best + share * (worst - best), lost + share * ((best - worst) @ agent.reward)
-
-
-def _greedy_occupancy(mdp, reward, values):
-    policy = tabular.greedy(tabular.action_values(mdp, reward, values))
-    return tabular.occupancy(mdp, policy)
 
 
 def _check(row: methods.Row, settings: Settings) -> None:

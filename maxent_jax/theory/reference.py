@@ -77,4 +77,4 @@ def _best_occupancy(mdp, mixed, smoothing, steps):
     reward = tabular.gradient(mixed, smoothing)
     zeros = jnp.zeros((len(mdp.discount), len(mixed)))
     values = tabular.plan(mdp, reward, zeros, steps)
-    return tabular.occupancy(mdp, tabular.greedy(tabular.action_values(mdp, reward, values)))
+    return tabular.greedy_occupancy(mdp, reward, values)

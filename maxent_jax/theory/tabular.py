@@ -13,6 +13,11 @@ import numpy as np
 
 from maxent_jax.theory.mdps import Mdp
 
+# Measured on two cores, 20 seeds side by side: a sum over so many successors is 2 to 10 times as
+# fast written out; and where there are more states than so many, it is faster to follow the flow of
+# an occupancy until it no longer changes than to solve for it.
+UNROLLED, SOLVED = 8, 100
+ROUNDING = 1e-14  # a smaller change of an occupancy, in the 1-norm, may be rounding alone
 CONVERGED = 1e-10  # what is left of the first error of the values once planning has converged
 
 
@@ -36,7 +41,13 @@ def action_values(mdp: Mdp, reward: jax.Array, values: jax.Array) -> jax.Array:
       [L, S, A], unnormalised: a sum over the rest of the episode.
     """
     following = values[mdp.next_layer] * mdp.discount[:, None]
-    expected = jnp.sum(mdp.probabilities[None] * following[:, mdp.successors], axis=-1)
+    most = mdp.successors.shape[-1]
+    if most > UNROLLED:
+        expected = jnp.sum(mdp.probabilities[None] * following[:, mdp.successors], axis=-1)
+    else:
+        chances = (mdp.probabilities[None, ..., i] for i in range(most))
+        reached = (following[:, mdp.successors[..., i]] for i in range(most))
+        expected = sum(map(jnp.multiply, chances, reached))
     return reward[None, :, None] + expected
 
 
@@ -89,12 +100,36 @@ def occupancy(mdp: Mdp, policy: jax.Array) -> jax.Array:
     Args:
       policy: [L, S, A] probabilities.
     """
-    if policy.shape[0] == 1:  # d = (1 - γ) start + γ Pᵀ d
-        moves = mdp.discount[0] * _transitions(mdp, policy[0])
-        begun = (1 - mdp.discount[0]) * mdp.start
-        return jnp.linalg.solve(jnp.eye(len(begun)) - moves.T, begun)
-    _, visits = jax.lax.scan(lambda d, p: (_push(mdp, p, d), d), mdp.start, policy)
-    return visits.mean(axis=0)
+    chances = policy[..., None] * mdp.probabilities[None]
+    shape = (*policy.shape[:2], -1)
+    reached = jnp.broadcast_to(mdp.successors, chances.shape)
+    return _occupancy(mdp, reached.reshape(shape), chances.reshape(shape))
+
+
+def greedy_occupancy(mdp: Mdp, reward: jax.Array, values: jax.Array) -> jax.Array:
+    """[S] of the policy that is greedy for these values, `greedy`'s."""
+    actions = action_values(mdp, reward, values).argmax(axis=-1)
+    states = jnp.arange(len(reward))
+    return _occupancy(mdp, mdp.successors[states, actions], mdp.probabilities[states, actions])
+
+
+def _occupancy(mdp, reached, chances):
+    """[S] where each layer's states lead to others, [L, S, M], with these chances."""
+    push = lambda d, reached, chances: jnp.zeros_like(d).at[reached].add(d[:, None] * chances)
+    if len(reached) > 1:
+        _, visits = jax.lax.scan(lambda d, move: (push(d, *move), d), mdp.start, (reached, chances))
+        return visits.mean(axis=0)
+    discount, begun = mdp.discount[0], (1 - mdp.discount[0]) * mdp.start  # d = begun + γ Pᵀ d
+    if len(begun) <= SOLVED:
+        rows = jnp.arange(len(begun))[:, None]
+        transitions = jnp.zeros((len(begun),) * 2).at[rows, reached[0]].add(chances[0])
+        return jnp.linalg.solve(jnp.eye(len(begun)) - discount * transitions.T, begun)
+    step = lambda d: begun + discount * push(d, reached[0], chances[0])
+    return jax.lax.while_loop(
+        lambda now: jnp.abs(now[0] - now[1]).sum() > ROUNDING,
+        lambda now: (step(now[0]), now[0]),
+        (step(mdp.start), mdp.start),
+    )[0]
 
 
 def random_policy(mdp: Mdp, key: jax.Array) -> jax.Array:
@@ -137,16 +172,3 @@ def sample_visits(mdp: Mdp, policy: jax.Array, max_steps: int, key: jax.Array) -
     begin = jnp.zeros((), jnp.int32), start.astype(jnp.int32), jnp.ones((), bool)
     _, (states, alive) = jax.lax.scan(step, begin, jax.random.split(key_steps, max_steps))
     return jnp.zeros(len(mdp.start)).at[states].add(alive)
-
-
-def _transitions(mdp: Mdp, policy: jax.Array) -> jax.Array:
-    """[S, S] under one layer's policy [S, A]."""
-    weights = policy[..., None] * mdp.probabilities
-    rows = jnp.arange(policy.shape[0])[:, None, None]
-    return jnp.zeros((policy.shape[0],) * 2).at[rows, mdp.successors].add(weights)
-
-
-def _push(mdp: Mdp, policy: jax.Array, occupancy: jax.Array) -> jax.Array:
-    """[S] where a step of one layer's policy takes a distribution."""
-    flow = occupancy[:, None, None] * policy[..., None] * mdp.probabilities
-    return jnp.zeros_like(occupancy).at[mdp.successors].add(flow)
