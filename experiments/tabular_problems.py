@@ -98,20 +98,19 @@ def make(
 
 def known(num_seeds: int, discount: float, toy: bool) -> dict[str, list[Mdp]]:
     """MDPs by name, one for all seeds; of Garnet one for each."""
-    if toy:  # of one shape, so that each program is compiled once
-        some = {"river swim": mdps.river_swim(), "Garnet": mdps.garnet(6, 2, 3, 0)}
-        return {name: [mdps.discounted(dynamics, discount)] for name, dynamics in some.items()}
-    some = {
+    some: dict[str, list[Dynamics]] = {
         "river swim": [mdps.river_swim()],
         "Garnet": [mdps.garnet(20, 4, 3, seed) for seed in range(num_seeds)],
         "four rooms": [mdps.four_rooms()],
         "small rooms": [mdps.four_rooms(11)],
         "open grid": [mdps.open_grid()],
     }
-    return {
-        "double chain": [mdps.finite_horizon(mdps.double_chain(), 20)],
-        **{name: [mdps.discounted(each, discount) for each in some[name]] for name in some},
-    }
+    if toy:  # of one shape, so that each program is compiled once
+        some = {"river swim": [mdps.river_swim()], "Garnet": [mdps.garnet(6, 2, 3, 0)]}
+    made = {name: [mdps.discounted(each, discount) for each in some[name]] for name in some}
+    if not toy:
+        made["double chain"] = [mdps.finite_horizon(mdps.double_chain(), 20)]
+    return made
 
 
 def read(path: Path, discount: float) -> Mdp:

@@ -4,6 +4,7 @@ The functions here are kernels: call them inside `float64()`, with an Mdp from `
 jit, vmap and scan as you like. Axes: S states, A actions, L layers of an Mdp; see mdps.Mdp.
 """
 
+import functools
 import math
 from contextlib import AbstractContextManager
 
@@ -47,7 +48,7 @@ def action_values(mdp: Mdp, reward: jax.Array, values: jax.Array) -> jax.Array:
     else:
         chances = (mdp.probabilities[None, ..., i] for i in range(most))
         reached = (following[:, mdp.successors[..., i]] for i in range(most))
-        expected = sum(map(jnp.multiply, chances, reached))
+        expected = functools.reduce(jnp.add, map(jnp.multiply, chances, reached))
     return reward[None, :, None] + expected
 
 
