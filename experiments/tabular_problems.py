@@ -122,7 +122,9 @@ def read(path: Path, discount: float) -> Mdp:
     try:
         with np.load(path) as file:
             return mdps.discounted(Dynamics(file["transitions"], file["start"]), discount)
-    except (OSError, KeyError, ValueError) as mistake:
+    except OSError as mistake:
+        raise cli.UsageError(f"--mdp {path} cannot be read: {mistake.strerror}.") from None
+    except (KeyError, ValueError) as mistake:
         raise cli.UsageError(f"--mdp {path} holds no MDP: {str(mistake).strip(chr(39))}.") from None
 
 
