@@ -331,7 +331,7 @@ def test_the_entry_point_at_toy_size(tmp_path, capsys):
         (["--iterations", "5"], "--iterations must be at least 20, to fit a rate."),
         (["--seeds", "1", "--few-seeds", "1"], "--seeds must be at least 2"),
         (["--seed", "-1"], "--seed must be 0 or more"),
-        (["--mdp", "nowhere.npz"], "--mdp nowhere.npz holds no MDP"),
+        (["--mdp", "nowhere.npz"], "--mdp nowhere.npz cannot be read"),
     ],
 )
 def test_bad_flags_are_one_sentence(flags, sentence):
