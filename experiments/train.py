@@ -24,6 +24,10 @@ LOCK = "lock"  # held while a process trains; the system frees a dead one's
 _FIELDS = [field for field in dataclasses.fields(Config) if field.name != "preset"]
 
 
+class BusyError(cli.UsageError):
+    """Another process trains there."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Arguments:
     """Train a mixture of policies that covers the state space, with no reward at all."""
@@ -32,8 +36,8 @@ class Arguments:
     out: Path | None = None
     """The run's directory; runs/ENV-METHOD-PRESET-SEED when left out."""
     resume: bool = False
-    """Go on from the last checkpoint in the run's directory; start over without one. With neither
-    --preset nor --env the settings are those of the run."""
+    """Go on from the last checkpoint in the run's directory; start over without one. With none of
+    --preset, --env and --method the settings are those of the run."""
     fallback: bool = False
     """With --resume: where the last checkpoint is damaged, remove it and take the one before."""
     overwrite: bool = False
@@ -79,11 +83,13 @@ def read_arguments(argv: Sequence[str]) -> Arguments:
 
 def _default_config(argv: Sequence[str]) -> Config:
     """What flags change: a preset, or the settings of the run to be resumed."""
-    name, env = cli.flag_value(argv, "--preset"), cli.flag_value(argv, "--env")
+    values = {name: cli.flag_value(argv, f"--{name}") for name in ("preset", "env", "method")}
+    given = {name: value for name, value in values.items() if value}
     out = cli.flag_value(argv, "--out")
-    if "--resume" in argv and out and not name and not env and Path(out, runs.CONFIG).exists():
+    if "--resume" in argv and out and not given and Path(out, runs.CONFIG).exists():
         return runs.read_config(Path(out))
-    return preset(name or Config.preset, env=env or Config.env)
+    name = given.pop("preset", Config.preset)
+    return preset(name, **given)
 
 
 @contextlib.contextmanager
@@ -91,7 +97,8 @@ def claimed(arguments: Arguments) -> Iterator[None]:
     """Makes the run's directory, and keeps other processes out of it while inside.
 
     Raises:
-      UsageError, RunError: see check_free; or it cannot be made, or another process trains in it.
+      BusyError: another process trains in it.
+      UsageError, RunError: see check_free; or it cannot be made.
     """
     directory = arguments.directory
     check_free(arguments)
@@ -100,7 +107,7 @@ def claimed(arguments: Arguments) -> Iterator[None]:
         directory.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except filelock.Timeout:
-        raise cli.UsageError(f"another process is training in {directory}.") from None
+        raise BusyError(f"another process is training in {directory}.") from None
     except OSError as error:
         raise cli.UsageError(f"cannot write to {directory}: {error.strerror}.") from None
     with lock:

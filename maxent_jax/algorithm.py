@@ -80,6 +80,7 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
     weights = method.weights[archive.size - 1]
     starts = base.draw_starts(learner.episodes.starts, config.mixture_episodes, key_starts)
     visited = occupancy.of_mixture(p, archive, weights, starts, key_rollout)
+    visited, weights = occupancy.corrected(p, visited, weights)
 
     # Before there is a history, the first rollouts stand in for one.
     unseen = (learner.history.seen == 0) & visited.alive
@@ -92,11 +93,15 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
     )
     scores = occupancy.score(p, visited, reference.points, rows, archive, reference.num_filled)
     best = occupancy.best(scores, visited)
+    replay = learner.replay
+    if not p.config.stale_rewards:
+        replay = experience.measure_all(p, reference, replay, learner.episodes.starts.obs)
     learner = learner._replace(
         agent=_start(p, method, archive, learner.agent, best, key_scratch),
-        replay=experience.measure_all(p, reference, learner.replay, learner.episodes.starts.obs),
+        replay=replay,
         reference=reference,
         history=history,
+        bonus=training.refresh_bonus(p, learner.bonus, visited),
     )
     metrics = {
         "weights": weights,
@@ -131,14 +136,24 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
     weights = state.method.weights[archive.size - 1]
     key_starts, key_rollout, key_rows = jax.random.split(jax.random.key(EVALUATION_SEED), 3)
     starts = base.draw_starts(learner.episodes.starts, config.mixture_episodes, key_starts)
-    visited = occupancy.of_mixture(p, archive, weights, starts, key_rollout)
+    visited = occupancy.of_mixture(
+        p,
+        archive,
+        weights,
+        starts,
+        key_rollout,
+        only_weighted=True,
+        deterministic=p.config.deterministic,
+    )
+    visited, weights = occupancy.corrected(p, visited, weights)
     state = state._replace(iteration=state.iteration + 1, archive=archive)
     metrics = {
         "iteration": state.iteration,
         "env_steps": learner.env_steps,
         "gradient_steps": learner.gradient_steps,
-        **_coverage("cumulative", learner.visits),
-        **(_coverage("random", learner.random_visits) if config.random_baseline else {}),
+        "mixture_weights": weights,
+        **coverage("cumulative", learner.visits),
+        **(coverage("random", learner.random_visits) if config.random_baseline else {}),
         **occupancy.measures(p, visited, key_rows),
     }
     return state, metrics
@@ -213,7 +228,8 @@ def _start(
     return chosen._replace(parameters=chosen.parameters._replace(log_temperature=initial))
 
 
-def _coverage(of: str, visits: training.Visits) -> Metrics:
+def coverage(of: str, visits: training.Visits) -> Metrics:
+    """Cells, entropy (nats) and share off the grid of all states met, by whose they are."""
     on_grid = jnp.sum(visits.cells)
     return {
         f"{of}_coverage": histogram.coverage(visits.cells),

@@ -23,7 +23,7 @@ from maxent_jax import (
     parts,
     runs,
 )
-from maxent_jax.config import Config
+from maxent_jax.config import CORRECTIVE, Config
 from maxent_jax.density import histogram
 from maxent_jax.mixture import Archive
 from maxent_jax.occupancy import Occupancy, Scores
@@ -73,6 +73,8 @@ class Run:
     @property
     def weights(self) -> np.ndarray:
         """[P] of the mixture's policies, 0 for empty slots."""
+        if self.config.weights == CORRECTIVE and self.num_policies > 1:
+            return self.metrics["mixture_weights"][self.num_policies - 2].astype(np.float32)
         return np.asarray(methods.make(self.config).weights[self.num_policies - 1])
 
     @property
@@ -185,7 +187,7 @@ class Run:
     @property
     def _parts_by_policy(self) -> Parts:
         """With which policies play equally often, and the states of each share its weight."""
-        return parts.make(dataclasses.replace(self.config, pooled=False))
+        return parts.make(dataclasses.replace(self.config, pooled=False, mixing="episode"))
 
     def _actor(self, index: int) -> Any:
         if not -self.num_policies <= index < self.num_policies:

@@ -14,14 +14,18 @@ BRAX_ENVS = (
 )
 TORSO_ENVS = ("ant", "humanoid")  # a floating torso has a heading, and can be upside down
 TURNING_ENVS = ("ant",)  # whose observation we know how to turn about the vertical
-METHODS = ("h", "la", "v")
+BONUSES = ("rnd", "icm", "ngu", "re3", "rise", "renyi", "vcse", "kmeans", "apt", "histogram")
+BASELINES = BONUSES[:-1]  # methods that one policy learns, paid by the bonus of that name
+METHODS = ("h", "la", "v", "h-official", *BASELINES)
 BACKENDS = ("auto", "mjx", "mujoco", "warp")
 PHYSICS = ("reference", "fast")
 REWARDS = ("log1p", "linear", "log", "paper")
 INPUTS = ("state", "heading")
 SPACES = ("features", "position")
 REPLAY_DTYPES = ("float32", "float16")
-WEIGHTS = ("method", "uniform", "geometric")
+CORRECTIVE = "fully_corrective"
+WEIGHTS = ("method", "uniform", "geometric", "last", CORRECTIVE)
+MIXINGS = ("episode", "step")
 REFERENCES = ("method", "mixture", "history")
 STARTS = ("method", "scratch", "last", "best")
 BY_METHOD = -1
@@ -39,7 +43,8 @@ class Config:
     """Environment: ant, walker2d, humanoid, pendulum, mountain_car, brax:NAME, or user:NAME for one
     that maxent_jax.envs.register was told of."""
     method: str = "v"
-    """h (Hazan 2019), la (Liu & Abbeel 2021) or v (Veritas)."""
+    """h (Hazan 2019), la (Liu & Abbeel 2021) or v (Veritas), as the paper reads them; h-official or
+    apt, the first two as their authors published them; or a baseline by the name of its bonus."""
     preset: str = "quick"
     """The values that the other flags start from: smoke, quick, gpu or paper."""
     backend: str = "auto"
@@ -75,6 +80,8 @@ class Config:
     """Share of the control range that the agent may use; below 1 departs from the paper."""
     end_flipped: bool = False
     """End an episode upside down; departs from the paper."""
+    end_unhealthy: bool = True
+    """End an episode where the robot's health fails."""
     policy_inputs: str = "state"
     """What the networks see: state, or heading (the same in the agent's own horizontal frame)."""
     yaw_copies: int = 0
@@ -93,8 +100,13 @@ class Config:
     alone: free of the noise of the joints)."""
     shaping_survives_death: bool = False
     """A state in which health fails keeps its potential: not policy-invariant."""
+    stale_rewards: bool = False
+    """Keep what a step was paid when it was taken, whatever becomes of the reference."""
     episodic_weight: float = 0.0
     """λ of the episodic term. 0: none."""
+    bonus: str = "none"
+    """What pays SAC in place of the distance to the reference: none, or a reward with a state of
+    its own (maxent_jax/bonuses): rnd, icm, ngu, re3, rise, renyi, vcse, kmeans, apt, histogram."""
 
     num_neighbors: int = 3
     """k."""
@@ -102,13 +114,19 @@ class Config:
     """M: states that define the reward."""
     mixture_episodes: int = 32
     """Episodes rolled out with the mixture for each refresh, and again for each evaluation."""
+    mixing: str = "episode"
+    """A policy of the mixture is drawn for each episode, or for each step."""
     pooled: bool = False
     """Draw the reference from the pooled states of the mixture, so that long-lived policies weigh
     more, instead of giving each policy its weight."""
     leave_own_out: bool = True
     """Score an archived policy without its own states in the reference."""
+    deterministic: bool = False
+    """The mixture's policies act by their mean where they are evaluated."""
     weights: str = "method"
-    """Of the mixture: uniform, geometric, or as the method says."""
+    """Of the mixture: uniform, geometric, last (the newest policy alone), fully_corrective (the
+    largest entropy that the archived policies can mix to, on the grid of the coverage), or as the
+    method says."""
     eta: float = 0.1
     """η of the geometric weights."""
     reference: str = "method"
@@ -182,6 +200,8 @@ class Config:
         `algorithm.init`.
         """
         defaults: dict[str, Any] = {name: _DEFAULTS[name] for name in DATA_FIELDS}
+        if self.weights == CORRECTIVE:  # a computation, not a table
+            del defaults["weights"]
         return dataclasses.replace(self, **defaults)
 
     def deviations(self) -> dict[str, str]:
@@ -212,13 +232,18 @@ _PAPER: dict[str, tuple[Any, str]] = {
     "physics": ("reference", "the physics is simplified"),
     "torque_limit": (1.0, "torques are limited to a share of the control range"),
     "end_flipped": (False, "an episode also ends upside down"),
+    "end_unhealthy": (True, "an episode goes on where health fails"),
     "policy_inputs": ("state", "networks see the state in the heading's frame"),
     "yaw_copies": (0, "episodes turned by a random yaw are learned from too"),
     "reward": ("paper", "the reward's form is not p log R"),
     "reward_scale": (1.0, "the reward is scaled"),
+    "stale_rewards": (False, "rewards are not those of the current reference"),
     "shaping": (0.0, "the reward is shaped by a potential"),
     "shaping_survives_death": (False, "the potential survives death: not policy-invariant"),
     "pooled": (False, "the reference is drawn from the pooled states of the mixture"),
+    "bonus": ("none", "SAC is not paid by the distance to the reference"),
+    "mixing": ("episode", "a policy of the mixture is drawn for each step"),
+    "deterministic": (False, "policies are evaluated by their mean actions"),
     "eta": (0.1, "η is not 0.1"),
     "num_neighbors": (3, "k is not 3"),
     "leave_own_out": (False, "policies are scored without their own states"),
@@ -333,17 +358,38 @@ _IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
     },
 }
 
+# What methods as their authors published them, and the baselines, do whatever the preset.
+_AS_PUBLISHED: dict[str, Any] = dict(
+    shaping=0.0, shaping_survives_death=False, episodic_weight=0.0, return_steps=1, reward_scale=1.0
+)
+# Factors that bring a bonus to a size of about 1, which the temperature is made for: measured on
+# normal states of 29 dimensions, where rnd, icm, re3, vcse and apt pay 0.6 to 1.2 as they are.
+_SIZES = {"kmeans": 50.0, "ngu": 0.03, "renyi": 0.03, "rise": 0.25}
+_OF_METHOD: dict[str, dict[str, Any]] = {
+    "h-official": dict(
+        bonus="histogram",
+        mixing="step",
+        deterministic=True,
+        leave_own_out=False,
+        **_AS_PUBLISHED,
+    ),
+    **{
+        name: _AS_PUBLISHED | dict(bonus=name, reward_scale=_SIZES.get(name, 1.0))
+        for name in BASELINES
+    },
+}
+
 
 def preset(name: str, **changes: Any) -> Config:
-    """The config of that preset, in its environment, with changes.
+    """The config of that preset, in its environment and for its method, with changes.
 
     Raises:
       ConfigError: an unknown preset, or a value that no run can have.
     """
     check_choice("preset", name, PRESETS)
-    env = changes.get("env", Config.env)
-    in_env = _IN_ENV.get((name, env), {})
-    return Config(**{"preset": name, **PRESETS[name], **in_env, **changes})
+    in_env = _IN_ENV.get((name, changes.get("env", Config.env)), {})
+    of_method = _OF_METHOD.get(changes.get("method", Config.method), {})
+    return Config(**{"preset": name, **PRESETS[name], **in_env, **of_method, **changes})
 
 
 def check_env(name: str) -> None:
@@ -382,6 +428,8 @@ def check_choice(what: str, value: str, known: Collection[str]) -> None:
 
 _CHOICES = {
     "method": METHODS,
+    "bonus": ("none", *BONUSES),
+    "mixing": MIXINGS,
     "preset": PRESETS,
     "reward": REWARDS,
     "policy_inputs": INPUTS,
@@ -432,12 +480,34 @@ def _check_together(c: Config) -> None:
     updates = c.updates_per_step * c.num_envs
     for wrong, sentence in (
         (
+            c.bonus != _OF_METHOD.get(c.method, {}).get("bonus", c.bonus),
+            f"method is {c.method}, but bonus is {c.bonus}: leave it to the method.",
+        ),
+        (
+            c.bonus != "none" and (c.return_steps > 1 or c.shaping > 0 or c.episodic_weight > 0),
+            f"bonus is {c.bonus}, which is paid by the step alone: return-steps must be 1, and "
+            f"shaping and episodic-weight 0.",
+        ),
+        (
+            c.mixing == "step" and (c.pooled or c.leave_own_out or c.weights == CORRECTIVE),
+            "mixing is step, where no state belongs to a policy: pooled, leave-own-out and fully "
+            "corrective weights need mixing episode.",
+        ),
+        (
+            c.pooled and c.weights == CORRECTIVE,
+            "pooled draws policies by their weights, which fully corrective ones only get later.",
+        ),
+        (
             c.torque_limit < 1 and c.env not in MUJOCO_ENVS,
             f"torque-limit is {c.torque_limit}, but {c.env} has no torques to limit.",
         ),
         (
             c.end_flipped and c.env not in TORSO_ENVS,
             f"end-flipped is on, but {c.env} has no floating torso that could be upside down.",
+        ),
+        (
+            not c.end_unhealthy and c.env not in MUJOCO_ENVS,
+            f"end-unhealthy is off, but {c.env} has no health that could fail.",
         ),
         (
             c.policy_inputs == "heading" and c.env not in TORSO_ENVS,

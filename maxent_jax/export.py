@@ -30,8 +30,7 @@ def policy(sac: Sac, actor: Any, deterministic: bool = False) -> export.Exported
         return agent.act(sac, actor, states, key)
 
     def mean(states):
-        gaussian_mean, _ = sac.actor.apply(actor, sac.inputs(states))
-        return jnp.tanh(gaussian_mean)
+        return agent.act(sac, actor, states, jax.random.key(0), deterministic=True)
 
     if deterministic:
         return export.export(jax.jit(mean), platforms=PLATFORMS)(states)

@@ -80,6 +80,7 @@ def make(config: Config) -> RunTask:
                 max_episode_steps=config.episode_length,
                 disable_env_checker=True,
                 exclude_current_positions_from_observation=False,
+                terminate_when_unhealthy=config.end_unhealthy,
             )
     except (gymnasium.error.Error, ImportError) as error:
         reason = " ".join(str(error).split())

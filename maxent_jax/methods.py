@@ -1,4 +1,8 @@
-"""MaxEnt-H, LA and V: three rows of data. The algorithm reads the arrays and knows no method."""
+"""MaxEnt-H, LA and V: rows of data. The algorithm reads the arrays and knows no method.
+
+The rows are what differs between programs' data; what a method as its authors published it does
+otherwise is in config.preset.
+"""
 
 from typing import NamedTuple
 
@@ -6,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from maxent_jax import mixture
-from maxent_jax.config import BY_METHOD, Config
+from maxent_jax.config import BASELINES, BY_METHOD, Config
 
 
 class Row(NamedTuple):
@@ -22,6 +26,8 @@ ROWS = {
     "h": Row("geometric", 0, "mixture", "scratch"),
     "la": Row("uniform", 1, "history", "last"),
     "v": Row("uniform", 0, "mixture", "best"),
+    "h-official": Row("geometric", 0, "mixture", "scratch"),
+    **{name: Row("last", 0, "mixture", "last") for name in BASELINES},
 }
 STARTS = ("scratch", "last", "best")
 

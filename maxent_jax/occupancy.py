@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from maxent_jax import mixture, rewards, rollout
+from maxent_jax.config import CORRECTIVE
 from maxent_jax.density import entropy, histogram
 from maxent_jax.density.knn import NONE_EXCLUDED, knn_distances
 from maxent_jax.envs.base import State
@@ -36,31 +37,68 @@ class Scores(NamedTuple):
 
 
 def of_mixture(
-    parts: Parts, archive: Archive, weights: jax.Array, starts: State, key: jax.Array
+    parts: Parts,
+    archive: Archive,
+    weights: jax.Array,
+    starts: State,
+    key: jax.Array,
+    only_weighted: bool = False,
+    deterministic: bool = False,
 ) -> Occupancy:
     """Rolls the mixture out, one policy for each episode.
 
     Unless the config pools, policies play equal numbers of episodes, up to one, and the states of
     each share its weight: episodes end early when health fails, and a pooled sample would weigh
-    policies by how long they live. Pooled, policies are drawn by weight and all states count alike.
+    policies by how long they live. Pooled, policies are drawn by weight and all states count alike;
+    and so they do where the config draws a policy by weight for each step.
 
     Args:
       weights: [P].
       starts: [E, ...].
+      only_weighted: spend no episode on a policy of weight 0.
+      deterministic: act by the policies' means.
     """
     key_assign, key_act = jax.random.split(key)
     num_episodes = starts.done.shape[0]
-    slots = jnp.arange(weights.shape[0])
+    if parts.config.mixing == "step":
+        act = _act_by_any(parts, archive, weights, deterministic)
+        reached = _play(parts, act, starts, key_act)
+        nobody = jnp.zeros(num_episodes, jnp.int32)
+        return of_episodes(parts, weights, nobody, *_visited(reached), alike=True)
     if parts.config.pooled:
         plays, offset = weights, jax.random.uniform(key_assign)
     else:
-        plays = (slots < archive.size) / archive.size
-        offset = jnp.asarray(0.5)
+        slots = jnp.arange(weights.shape[0])
+        chosen = weights > 0 if only_weighted else slots < archive.size
+        plays, offset = chosen / jnp.sum(chosen), jnp.asarray(0.5)
     episode_policy = mixture.assign_episodes(plays, num_episodes, offset)
-    reached = play(parts, archive, episode_policy, starts, key_act)
-    return of_episodes(
-        parts, weights, episode_policy, reached.states, reached.alive, reached.num_invalid
-    )
+    reached = play(parts, archive, episode_policy, starts, key_act, deterministic)
+    pooled = parts.config.pooled
+    return of_episodes(parts, weights, episode_policy, *_visited(reached), alike=pooled)
+
+
+def corrected(
+    parts: Parts, occupancy: Occupancy, weights: jax.Array
+) -> tuple[Occupancy, jax.Array]:
+    """The same states with fully corrective weights where the config has them, and the weights.
+
+    Args:
+      weights: [P] with which the occupancy was made.
+    """
+    if parts.config.weights != CORRECTIVE:
+        return occupancy, weights
+
+    def cells_of(slot):
+        share = jnp.where(occupancy.policy == slot, occupancy.weight, 0.0)
+        share = share / jnp.maximum(jnp.sum(share), 1e-30)
+        return histogram.count(occupancy.states, parts.grid, share).reshape(-1)
+
+    cells = jax.vmap(cells_of)(jnp.arange(weights.shape[0]))
+    off_grid = jnp.maximum(1 - jnp.sum(cells, axis=1, keepdims=True), 0.0)
+    found = mixture.most_entropic_weights(jnp.concatenate([cells, off_grid], axis=1), weights)
+    factor = jnp.where(weights > 0, found / jnp.where(weights > 0, weights, 1), 0.0)
+    weight = occupancy.weight * factor[occupancy.policy]
+    return occupancy._replace(weight=weight / jnp.sum(weight)), found
 
 
 def of_episodes(
@@ -70,6 +108,7 @@ def of_episodes(
     states: jax.Array,
     alive: jax.Array,
     num_invalid: jax.Array,
+    alike: bool = False,
 ) -> Occupancy:
     """The states of episodes that were played, weighted as of_mixture says.
 
@@ -77,11 +116,12 @@ def of_episodes(
       weights: [P].
       episode_policy: [E] int32, who played each.
       states, alive: [T, E, D] and [T, E] bool, as in Trajectories.
+      alike: every state counts the same, whoever reached it.
     """
     states = states.reshape(-1, states.shape[-1])
     policy = jnp.broadcast_to(episode_policy, alive.shape).reshape(-1)
     lives = alive.reshape(-1).astype(jnp.float32)
-    if parts.config.pooled:
+    if alike:
         weight = lives
     else:
         lived = jnp.zeros(weights.shape[0]).at[policy].add(lives)
@@ -98,7 +138,12 @@ def of_episodes(
 
 
 def play(
-    parts: Parts, archive: Archive, episode_policy: jax.Array, starts: State, key: jax.Array
+    parts: Parts,
+    archive: Archive,
+    episode_policy: jax.Array,
+    starts: State,
+    key: jax.Array,
+    deterministic: bool = False,
 ) -> Trajectories:
     """Episodes from `starts` [E, ...], each played by the policy in its slot, [E] int32.
 
@@ -108,10 +153,35 @@ def play(
 
     def act(observation, key_step):
         keys = jax.random.split(key_step, episode_policy.shape[0])
-        one = lambda actor, s, k: agent.act(parts.sac, actor, s, k)
+        one = lambda actor, s, k: agent.act(parts.sac, actor, s, k, deterministic)
         return jax.vmap(one)(actors, observation, keys)
 
+    return _play(parts, act, starts, key)
+
+
+def _act_by_any(parts: Parts, archive: Archive, weights: jax.Array, deterministic: bool):
+    """observation [E, D], key -> [E, A] by a policy drawn by weight for each episode's step.
+
+    All policies act, and one action is taken: weights of networks are not moved.
+    """
+
+    def act(observation, key_step):
+        key_draw, key_act = jax.random.split(key_step)
+        keys = jax.random.split(key_act, weights.shape[0])
+        one = lambda actor, k: agent.act(parts.sac, actor, observation, k, deterministic)
+        actions = jax.vmap(one)(archive.parameters.actor, keys)  # [P, E, A]
+        drawn = jax.random.categorical(key_draw, jnp.log(weights), shape=observation.shape[:1])
+        return jnp.take_along_axis(actions, drawn[None, :, None], axis=0)[0]
+
+    return act
+
+
+def _play(parts, act, starts, key):
     return rollout.episodes(parts.env, starts, act, parts.config.episode_length, key)
+
+
+def _visited(reached: Trajectories) -> tuple[jax.Array, jax.Array, jax.Array]:
+    return reached.states, reached.alive, reached.num_invalid
 
 
 def score(

@@ -4,9 +4,11 @@ import functools
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
-from maxent_jax import envs
-from maxent_jax.config import MUJOCO_ENVS, Config
+from maxent_jax import bonuses, envs
+from maxent_jax.bonuses import Bonus
+from maxent_jax.config import CLASSIC_ENVS, MUJOCO_ENVS, Config
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs.base import Env
 from maxent_jax.envs.task import observation_size
@@ -25,6 +27,7 @@ class Parts(NamedTuple):
     torso: Torso | None
     sac: agent.Sac
     phi: Features
+    bonus: Bonus | None = None
 
 
 def make(config: Config) -> Parts:
@@ -38,7 +41,8 @@ def _make(config: Config) -> Parts:
         entry = envs.entry(config.env)
         deviations: dict[str, Any] = {}
         if config.env in MUJOCO_ENVS:
-            deviations = {"torque_limit": config.torque_limit, "end_flipped": config.end_flipped}
+            names = ("torque_limit", "end_flipped", "end_unhealthy")
+            deviations = {name: getattr(config, name) for name in names}
         env = entry.make(config.backend, config.physics, **deviations)
         inputs = lambda observation: observation
         if config.policy_inputs == "heading":
@@ -46,4 +50,23 @@ def _make(config: Config) -> Parts:
             inputs = entry.torso.heading_inputs
         sac = agent.make(config, observation_size(env), env.action_size, inputs)
         phi = make_feature_map(config.env)
-        return Parts(config, env, entry.grid, entry.torso, sac, phi)
+        bonus = None
+        if config.bonus != "none":
+            units = _units(config, entry.grid, len(phi.names))
+            bonus = bonuses.make(
+                config.bonus,
+                len(phi.names),
+                env.action_size,
+                units,
+                config.learning_rate,
+                entry.grid.num_cells,
+            )
+        return Parts(config, env, entry.grid, entry.torso, sac, phi, bonus)
+
+
+def _units(config: Config, grid: Grid, num_features: int) -> jax.Array:
+    """[F] what counts as 1 to a bonus: an eighth of the grid's side where features are metres."""
+    sides = [1.0, 1.0]
+    if config.env not in CLASSIC_ENVS:
+        sides = [(high - low) / 8 for low, high in zip(grid.low, grid.high, strict=True)]
+    return jnp.asarray((sides + [1.0] * num_features)[:num_features])

@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 
 from maxent_jax.analysis import Paths, Run
@@ -109,14 +110,10 @@ def occupancy_map(run: Run, mixture_cells: np.ndarray) -> Figure:
         ("states met in training", run.histogram / max(run.histogram.sum(), 1)),
         ("rollouts of the mixture", mixture_cells),
     )
-    shares = [np.log10(np.where(cells > 0, cells, np.nan)) for _, cells in panels]
-    visited = np.concatenate([share[np.isfinite(share)] for share in shares])
-    low, high = (visited.min(), visited.max()) if visited.size else (None, None)
-    for ax, (title, _), share in zip(figure.subplots(1, 2), panels, shares, strict=True):
-        image = ax.imshow(
-            share.T, origin="lower", extent=_extent(run), aspect="auto", vmin=low, vmax=high
-        )
-        _name_axes(ax, run)
+    visited = np.concatenate([np.log10(cells[cells > 0]) for _, cells in panels])
+    limits = (visited.min(), visited.max()) if visited.size else (None, None)
+    for ax, (title, cells) in zip(figure.subplots(1, 2), panels, strict=True):
+        image = draw_occupancy(ax, run, cells, limits)
         ax.set_title(title)
     figure.colorbar(image, ax=figure.axes, label="log10 share of the states", shrink=0.85)
     return _finish(figure, run)
@@ -126,15 +123,42 @@ def fireworks(run: Run, paths: Paths) -> Figure:
     """Where the episodes of each policy go, one colour for each policy."""
     figure = Figure(figsize=(7.4, 6.6), layout="constrained")
     ax = figure.subplots()
+    draw_paths(ax, run, paths)
+    for policy, color in enumerate(policy_colors(run.num_policies)):
+        ax.plot([], [], color=color, label=f"π{policy}" + (" (untrained)" if policy == 0 else ""))
+    ax.set_title("paths of the archived policies; dots where they end")
+    ax.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
+    return _finish(figure, run)
+
+
+def draw_occupancy(
+    ax: Axes,
+    run: Run,
+    shares: np.ndarray,
+    limits: tuple[float | None, float | None] = (None, None),
+) -> AxesImage:
+    """log10 of the share of states in each cell, [bins, bins], within limits of the colours."""
+    low, high = limits
+    image = ax.imshow(
+        np.log10(np.where(shares > 0, shares, np.nan)).T,
+        origin="lower",
+        extent=_extent(run),
+        aspect="auto",
+        vmin=low,
+        vmax=high,
+    )
+    _name_axes(ax, run)
+    return image
+
+
+def draw_paths(ax: Axes, run: Run, paths: Paths) -> None:
+    """Where the episodes of each policy go, and the grid's edge."""
     colors = policy_colors(run.num_policies)
     for states, alive, policy in zip(*paths, strict=True):
         xy = np.asarray(histogram.locate(states[alive], run.parts.grid))
         ax.plot(*xy.T, color=colors[policy], lw=0.9, alpha=0.8)
         ax.plot(*xy[-1:].T, "o", color=colors[policy], ms=3)
-    for policy, color in enumerate(colors):
-        ax.plot([], [], color=color, label=f"π{policy}" + (" (untrained)" if policy == 0 else ""))
     _name_axes(ax, run)
-    ax.set_title("paths of the archived policies; dots where they end")
     low_x, high_x, low_y, high_y = _extent(run)
     ax.plot(
         [low_x, high_x, high_x, low_x, low_x],
@@ -146,8 +170,6 @@ def fireworks(run: Run, paths: Paths) -> Figure:
     if run.parts.torso is not None:  # a map, seen from above
         ax.set_aspect("equal")
     ax.grid(alpha=0.25)
-    ax.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
-    return _finish(figure, run)
 
 
 def policy_colors(num_policies: int) -> np.ndarray:

@@ -14,7 +14,7 @@ from typing import Any
 
 from maxent_jax.config import Config, ConfigError
 
-SCHEMA = 3  # of the directory, checkpoints included
+SCHEMA = 4  # of the directory, checkpoints included
 CONFIG, METRICS, FIGURES = "config.json", "metrics.jsonl", "figures"
 # All that any entry point writes there.
 WRITTEN = (
@@ -145,7 +145,7 @@ def jsonable(value: Any) -> Any:
         return {key: jsonable(item) for key, item in value.items()}
     if hasattr(value, "tolist"):
         value = value.tolist()
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return [jsonable(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None

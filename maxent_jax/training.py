@@ -1,23 +1,25 @@
 """One step of all envs with its gradient steps, against the reward of the moment."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from maxent_jax import experience, rewards
+from maxent_jax.bonuses import Steps
 from maxent_jax.density import histogram, reservoir
 from maxent_jax.density.reservoir import Reservoir
 from maxent_jax.envs import base
 from maxent_jax.envs.base import Episodes
 from maxent_jax.experience import Reference
 from maxent_jax.methods import Method
+from maxent_jax.occupancy import Occupancy
 from maxent_jax.parts import Parts
 from maxent_jax.sac import agent as sac_agent
 from maxent_jax.sac import losses
 from maxent_jax.sac.agent import Agent
 from maxent_jax.sac.replay import Replay
-from maxent_jax.types import Metrics, Outcomes, Transition
+from maxent_jax.types import Experience, Metrics, Outcomes, Transition
 
 
 class Visits(NamedTuple):
@@ -34,7 +36,8 @@ class Learner(NamedTuple):
     replay: Replay
     place: jax.Array  # [N] int32, where the replay finds each env's state: see experience.Step
     episodes: Episodes  # [N] of the agent; then, with the random baseline, [N] of that
-    memory: jax.Array | None  # [N, T, F] states of each episode so far, for the episodic term
+    memory: jax.Array | None  # [N, T, F] states of each episode so far, for an episodic term
+    bonus: Any  # the bonus's state; None without one
     reference: Reference
     history: Reservoir
     visits: Visits
@@ -47,12 +50,15 @@ def init(parts: Parts, key: jax.Array) -> Learner:
     """A fresh learner with fresh episodes, an empty replay, and no reference yet."""
     config, sac = parts.config, parts.sac
     key_agent, key_episodes = jax.random.split(key)
+    key_bonus = jax.random.fold_in(key, 2)
     num_rows = config.num_envs * (2 if config.random_baseline else 1)
     dims = len(parts.phi.names)
     episodes = base.init(parts.env, num_rows, config.num_starts, key_episodes)
+    episodic = parts.bonus and parts.bonus.episodic
+    remembered = episodic.size if episodic else dims
     memory = None
-    if config.episodic_weight > 0:
-        memory = jnp.zeros((config.num_envs, config.episode_length, dims))
+    if config.episodic_weight > 0 or episodic:
+        memory = jnp.zeros((config.num_envs, config.episode_length, remembered))
     zero = jnp.zeros((), jnp.int32)
     unvisited = Visits(jnp.zeros(parts.grid.bins, jnp.int32), zero)
     return Learner(
@@ -61,6 +67,7 @@ def init(parts: Parts, key: jax.Array) -> Learner:
         place=-1 - episodes.start[: config.num_envs],
         episodes=episodes,
         memory=memory,
+        bonus=parts.bonus.init(key_bonus) if parts.bonus else None,
         reference=Reference(jnp.zeros((config.reference_size, dims)), zero),
         history=reservoir.init(config.reference_size, dims),
         visits=unvisited,
@@ -91,9 +98,9 @@ def step(parts: Parts, method: Method, learner: Learner, key: jax.Array) -> tupl
     features = parts.phi(transition.next_observation)
     history = reservoir.add(learner.history, features, transition.valid, key_history)
     reference = _refreshed(parts, method, learner, history)
-    bonus, memory = _episodic(parts, learner.memory, transition, features, age)
+    bonus, memory, novelty = _episodic(parts, learner, transition, features, age)
     ring, rows = experience.add(
-        parts, reference, learner.replay, transition, learner.place, bonus, key_yaw
+        parts, reference, learner.replay, transition, learner.place, novelty, key_yaw
     )
     ended = transition.terminated | transition.truncated
     learner = learner._replace(
@@ -101,10 +108,11 @@ def step(parts: Parts, method: Method, learner: Learner, key: jax.Array) -> tupl
         place=jnp.where(ended, -1 - episodes.start[: config.num_envs], rows),
         episodes=episodes,
         memory=memory,
+        bonus=bonus,
         reference=reference,
         history=history,
-        visits=_visit(parts, learner.visits, transition),
-        random_visits=_visit(parts, learner.random_visits, others),
+        visits=visit(parts, learner.visits, transition.next_observation, transition.valid),
+        random_visits=visit(parts, learner.random_visits, others.next_observation, others.valid),
         env_steps=learner.env_steps + config.num_envs,
         gradient_steps=learner.gradient_steps + config.updates_per_vector_step,
     )
@@ -182,21 +190,28 @@ def _changes_within_iteration(method: Method) -> jax.Array:
     return method.from_history & (method.refresh_period > 0)
 
 
-def _episodic(parts, memory, transition: Transition, features, age):
-    """The episodic term of each state reached, and the memory with the states left behind."""
-    config = parts.config
+def _episodic(parts, learner, transition: Transition, features, age):
+    """The bonus, the memory with the states left behind, and the episodic term of those reached."""
+    config, bonus, memory = parts.config, learner.bonus, learner.memory
     if memory is None:
-        return jnp.zeros(config.num_envs), memory
-    rows = jnp.arange(config.num_envs)
-    memory = memory.at[rows, age].set(parts.phi(transition.observation))
-    return rewards.episodic_bonus(features, memory, age + 1, config.num_neighbors), memory
+        return bonus, memory, jnp.zeros(config.num_envs)
+    rows, left = jnp.arange(config.num_envs), parts.phi(transition.observation)
+    if parts.bonus is None:
+        memory = memory.at[rows, age].set(left)
+        novelty = rewards.episodic_bonus(features, memory, age + 1, config.num_neighbors)
+        return bonus, memory, novelty
+    episodic = parts.bonus.episodic
+    memory = memory.at[rows, age].set(episodic.embed(bonus, left))
+    embedded = episodic.embed(bonus, features)
+    bonus, novelty = episodic.novelty(bonus, embedded, memory, age + 1)
+    return bonus, memory, novelty
 
 
-def _visit(parts: Parts, visits: Visits, transition: Transition) -> Visits:
-    grid = parts.grid
-    valid = transition.valid.astype(jnp.int32)
-    cells = histogram.count(transition.next_observation, grid, valid)
-    return Visits(visits.cells + cells, visits.off_grid + jnp.sum(valid) - jnp.sum(cells))
+def visit(parts: Parts, visits: Visits, states: jax.Array, counts: jax.Array) -> Visits:
+    """With the states [B, D] that count, [B] bool."""
+    number = counts.astype(jnp.int32)
+    cells = histogram.count(states, parts.grid, number)
+    return Visits(visits.cells + cells, visits.off_grid + jnp.sum(number) - jnp.sum(cells))
 
 
 def _learn(
@@ -209,13 +224,16 @@ def _learn(
     drawn = experience.sample(parts, learner.replay, learner.episodes.starts.obs, shape, key_sample)
     # Stored distances hold while the reference does; the branch touches the drawn rows alone.
     distances = jax.lax.cond(
-        _changes_within_iteration(method),
+        _changes_within_iteration(method) & (not config.stale_rewards),
         lambda x: experience.measure(parts, learner.reference, x.features, x.next_features),
         lambda x: x.distances,
         drawn.outcomes,
     )
     outcomes = drawn.outcomes._replace(distances=distances)
-    paid = reward(parts, outcomes)
+    if parts.bonus is None:
+        bonus, paid = learner.bonus, reward(parts, outcomes)
+    else:
+        bonus, paid = _paid_by_bonus(parts, learner, drawn, jax.random.fold_in(key, 2))
     total, beyond = returns(outcomes, paid, config.discount)
     batches = losses.Batch(drawn.observation, drawn.action, total, drawn.next_observation, beyond)
 
@@ -230,4 +248,46 @@ def _learn(
         "replay_paid": jnp.mean(paid[..., 0]),
         "replay_bonus": jnp.mean(outcomes.bonus[..., 0]),
     }
-    return learner._replace(agent=agent), metrics
+    return learner._replace(agent=agent, bonus=bonus), metrics
+
+
+def _paid_by_bonus(
+    parts: Parts, learner: Learner, drawn: Experience, key: jax.Array
+) -> tuple[Any, jax.Array]:
+    """The bonus once it has learned from what was drawn, and what it paid for it before, [..., 1].
+
+    It sees features, as every other reward does.
+    """
+    payer = parts.bonus
+    assert payer is not None
+    key_value, key_reward, key_learn = jax.random.split(key, 3)
+    parameters, outcomes = learner.agent.parameters, drawn.outcomes
+    steps = Steps(
+        observation=outcomes.features[..., 0, :],
+        action=drawn.action,
+        next_observation=outcomes.next_features[..., 0, :],
+        value=sac_agent.value(parts.sac, parameters, drawn.next_observation, key_value),
+        episodic=outcomes.bonus[..., 0],
+        cell=_cells(parts, drawn.next_observation),
+    )
+    together = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps)
+    bonus, paid = payer.reward(learner.bonus, together, key_reward)
+
+    def learn(bonus, batch_and_key):
+        return payer.learn(bonus, *batch_and_key)[0], None
+
+    keys = jax.random.split(key_learn, steps.value.shape[0])
+    bonus, _ = jax.lax.scan(learn, bonus, (steps, keys))
+    return bonus, parts.config.reward_scale * paid.reshape(*steps.value.shape, 1)
+
+
+def _cells(parts: Parts, states: jax.Array) -> jax.Array:
+    flat = states.reshape(-1, states.shape[-1])
+    return histogram.cells(flat, parts.grid).reshape(states.shape[:-1])
+
+
+def refresh_bonus(parts: Parts, bonus: Any, visited: Occupancy) -> Any:
+    """The bonus with the states that the mixture visits, where it asks for them."""
+    if parts.bonus is None or parts.bonus.refresh is None:
+        return bonus
+    return parts.bonus.refresh(bonus, histogram.count(visited.states, parts.grid, visited.weight))

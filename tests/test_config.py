@@ -86,7 +86,7 @@ def test_a_hybrid_of_methods_is_named():
 
 
 def test_choices_are_those_of_the_modules_that_make_them():
-    from maxent_jax import config, envs, methods, rewards
+    from maxent_jax import bonuses, config, envs, methods, rewards
 
     torsos = {name: task.torso for name, task in envs.TASKS.items() if task.torso is not None}
     assert set(config.MUJOCO_ENVS) == set(envs.TASKS)
@@ -94,5 +94,6 @@ def test_choices_are_those_of_the_modules_that_make_them():
     assert set(config.TORSO_ENVS) == set(torsos)
     assert set(config.TURNING_ENVS) == {n for n, t in torsos.items() if t.rotate is not None}
     assert set(config.METHODS) == set(methods.ROWS)
+    assert set(config.BONUSES) == set(bonuses.NAMES)
     assert set(config.REWARDS) == set(rewards.FORMS)
     assert set(config.STARTS) == {"method", *methods.STARTS}

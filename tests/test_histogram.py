@@ -127,3 +127,15 @@ def test_the_entropy_is_that_of_scipy_and_does_not_depend_on_the_scale(scale):
 @pytest.mark.parametrize("dtype", [jnp.int32, jnp.float32])
 def test_the_entropy_of_no_visits_is_zero(dtype):
     assert histogram.shannon_entropy(jnp.zeros((5, 5), dtype)) == 0
+
+
+@GRIDS
+def test_coverage_only_grows_as_states_are_added(grid):
+    rng = np.random.default_rng(2)
+    counts, before = jnp.zeros(grid.bins, jnp.int32), 0
+    for _ in range(6):
+        counts = counts + histogram.count(random_states(rng, grid, 40), grid)
+        after = int(histogram.coverage(counts))
+        assert after >= before
+        before = after
+    assert before > 40

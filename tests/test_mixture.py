@@ -215,3 +215,31 @@ def test_another_key_draws_other_rows():
     weights = jnp.ones(1000)
     draws = [np.asarray(mixture.draw_rows(weights, 50, jax.random.key(i))) for i in range(2)]
     assert (draws[0] != draws[1]).any()
+
+
+def test_the_last_policy_alone():
+    np.testing.assert_array_equal(mixture.last_weights(4), [0, 0, 0, 1])
+    table = mixture.weight_table("last", 3, eta=0.1)
+    np.testing.assert_array_equal(table, np.eye(3))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_weights_found_within_a_program_are_those_of_a_solver(seed):
+    random = np.random.default_rng(seed)
+    occupancies = random.dirichlet(np.full(40, 0.1), 6)
+    begun = np.append(np.full(6, 1 / 6), 0.0).astype(np.float32)  # and an empty slot
+    found = np.asarray(
+        jax.jit(mixture.most_entropic_weights)(
+            jnp.asarray(np.vstack([occupancies, np.zeros(40)]), jnp.float32), begun
+        )
+    )
+    assert found[6] == 0 and found.min() >= 0
+    assert found.sum() == pytest.approx(1, abs=1e-5)
+
+    def entropy(weights):
+        mixed = weights @ occupancies
+        return -(mixed * np.log(np.maximum(mixed, 1e-300))).sum()
+
+    best = entropy(mixture.fully_corrective_weights(occupancies, 1e-12))
+    assert entropy(np.full(6, 1 / 6)) < best - 1e-3  # so that there was something to find
+    assert best - entropy(found[:6]) < np.log(6) / mixture.CORRECTIVE_ROUNDS  # derived: its bound

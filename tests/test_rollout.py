@@ -8,6 +8,7 @@ from brax.envs.base import Env, State
 
 from maxent_jax import mixture, occupancy, parts, rollout
 from maxent_jax.config import preset
+from maxent_jax.density import histogram
 from maxent_jax.envs import base
 from maxent_jax.occupancy import Occupancy, Scores
 from maxent_jax.parts import Parts
@@ -164,20 +165,82 @@ def test_empty_slots_do_not_play(key):
     np.testing.assert_allclose(share, weights[:2], atol=1e-5)
 
 
-def test_an_episode_is_played_by_its_own_policy(key):
-    p = make_parts()
-    archive = make_archive(p, 2)
-    # The output layer's bias alone: full torque up or down, and hardly any noise.
+def push_apart(archive):
+    """Its two policies push with full torque up or down, and hardly any noise; the third not."""
+    # The output layer's bias alone.
     output = archive.parameters.actor["params"]["Dense_0"]
     output["kernel"] = jnp.zeros_like(output["kernel"])
     push = jnp.array([[10.0], [-10.0], [0.0]])
     output["bias"] = jnp.concatenate([jnp.tile(push, 8), jnp.full((3, 8), -9.0)], axis=1)
+    return archive
+
+
+def test_an_episode_is_played_by_its_own_policy(key):
+    p = make_parts()
+    archive = push_apart(make_archive(p, 2))
     starts = make_starts(p)
     found = jax.jit(lambda a, s: occupancy.of_mixture(p, a, WEIGHTS, s, key))(archive, starts)
     torque = jnp.where(found.episode_policy == 0, 1.0, -1.0)
     after = jax.jit(jax.vmap(p.env.step))(starts, jnp.tile(torque[:, None], 8))
     # tanh(10 ± 0.03) is 1 to the last place of a float32.
     np.testing.assert_allclose(found.states[: len(torque)], after.obs, atol=1e-5)
+
+
+def test_a_policy_can_be_drawn_for_each_step(key):
+    p = make_parts(mixing="step", leave_own_out=False)
+    starts = make_starts(p)
+    archive = push_apart(make_archive(p, 2))
+    run = jax.jit(lambda a, w, s, k: occupancy.of_mixture(p, a, w, s, k))
+    up, down = (
+        jax.jit(jax.vmap(p.env.step))(starts, jnp.full((8, 8), sign)).obs for sign in (1.0, -1.0)
+    )
+    chosen = []
+    for one in jax.random.split(key, 40):
+        found = run(archive, jnp.array([0.25, 0.75, 0.0]), starts, one)
+        first = found.states[:8]
+        is_up = jnp.abs(first - up).max(1) < 1e-4
+        assert (is_up | (jnp.abs(first - down).max(1) < 1e-4)).all()
+        chosen.append(is_up)
+    # Derived: 320 draws of probability 1/4; four standard errors.
+    assert np.mean(chosen) == pytest.approx(0.25, abs=4 * np.sqrt(0.25 * 0.75 / 320))
+    assert (np.std(np.stack(chosen), axis=0) > 0).all()  # each episode meets both
+    alive = np.asarray(found.alive)
+    np.testing.assert_allclose(np.asarray(found.weight)[alive], 1 / alive.sum(), rtol=1e-5)
+
+
+def test_evaluation_plays_the_policies_that_count_by_their_means_if_asked(key):
+    p = make_parts()
+    archive, starts = make_archive(p, 3), make_starts(p)
+    weights = jnp.array([0.0, 0.0, 1.0])
+    run = jax.jit(
+        lambda a, s, k: occupancy.of_mixture(
+            p, a, weights, s, k, only_weighted=True, deterministic=True
+        )
+    )
+    found = run(archive, starts, key)
+    np.testing.assert_array_equal(found.episode_policy, np.full(8, 2))
+    again = run(archive, starts, jax.random.key(99))
+    np.testing.assert_array_equal(found.states, again.states)  # no draw is left
+
+
+@pytest.mark.parametrize("corrective", [False, True])
+def test_fully_corrective_weights_raise_the_entropy_of_the_same_states(key, corrective):
+    p = make_parts(weights="fully_corrective" if corrective else "uniform")
+    archive, starts = make_archive(p, 3), make_starts(p)
+    before = jax.jit(lambda a, s: occupancy.of_mixture(p, a, WEIGHTS, s, key))(archive, starts)
+    after, weights = jax.jit(lambda o: occupancy.corrected(p, o, WEIGHTS))(before)
+
+    def entropy(found):
+        cells = histogram.count(found.states, p.grid, found.weight)
+        return float(histogram.shannon_entropy(cells))
+
+    share = np.bincount(np.asarray(after.policy), np.asarray(after.weight), minlength=3)
+    np.testing.assert_allclose(share, weights, atol=1e-4)
+    if corrective:
+        assert entropy(after) > entropy(before) + 1e-3
+    else:
+        np.testing.assert_array_equal(after.weight, before.weight)
+        np.testing.assert_array_equal(weights, WEIGHTS)
 
 
 # Score and best, on occupancies made by hand.

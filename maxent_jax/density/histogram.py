@@ -17,6 +17,11 @@ class Grid(NamedTuple):
     coordinates: tuple[int, int] = (0, 1)  # of the state, or of its transform
     transform: Callable[[jax.Array], jax.Array] | None = None  # [..., D] -> [..., at least 2]
 
+    @property
+    def num_cells(self) -> int:
+        """Of both axes together."""
+        return self.bins[0] * self.bins[1]
+
 
 def locate(states: jax.Array, grid: Grid) -> jax.Array:
     """[..., 2]: the grid's coordinates of states [..., D]."""
@@ -35,16 +40,19 @@ def count(states: jax.Array, grid: Grid, weights: jax.Array | None = None) -> ja
       [bins, bins] in the weights' dtype, else int32. States off the grid, and NaN, are dropped.
     """
     weights = jnp.ones(states.shape[0], jnp.int32) if weights is None else weights
+    counts = jnp.zeros(grid.num_cells, weights.dtype)
+    return counts.at[cells(states, grid)].add(weights, mode="drop").reshape(grid.bins)
+
+
+def cells(states: jax.Array, grid: Grid) -> jax.Array:
+    """[B] int32: the cell of each state [B, D], row by row; num_cells off the grid, and for NaN."""
     position = locate(states, grid)
     low, high, bins = (jnp.array([x], jnp.float32) for x in (grid.low, grid.high, grid.bins))
     cell = jnp.floor((position - low) / (high - low) * bins)
     cell = jnp.minimum(cell, bins - 1)  # the upper edge, and what rounds up to it
     inside = ((position >= low) & (position <= high)).all(-1)
     row, column = jnp.where(inside[:, None], cell, 0).astype(jnp.int32).T
-    num_cells = grid.bins[0] * grid.bins[1]
-    flat = jnp.where(inside, row * grid.bins[1] + column, num_cells)
-    counts = jnp.zeros(num_cells, weights.dtype).at[flat].add(weights, mode="drop")
-    return counts.reshape(grid.bins)
+    return jnp.where(inside, row * grid.bins[1] + column, grid.num_cells)
 
 
 def coverage(counts: jax.Array) -> jax.Array:

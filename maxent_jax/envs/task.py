@@ -44,6 +44,7 @@ class MujocoEnv(Env):
       torque_limit: share of the control range that an action of 1 uses. Below 1 it departs from
         Gymnasium.
       end_flipped: also end an episode once the torso is upside down. Departs from Gymnasium.
+      end_unhealthy: end an episode where health fails, as Gymnasium does.
     Raises:
       ConfigError: an unknown backend or profile, or one that cannot run the task here.
     """
@@ -55,6 +56,7 @@ class MujocoEnv(Env):
         profile: str | Options = "reference",
         torque_limit: float = 1.0,
         end_flipped: bool = False,
+        end_unhealthy: bool = True,
     ):
         self.task = task
         self._backend = resolve_backend(backend)
@@ -74,6 +76,7 @@ class MujocoEnv(Env):
         self._control_center = jnp.asarray((high + low) / 2, jnp.float32)
         self._control_span = jnp.asarray((high - low) / 2 * torque_limit, jnp.float32)
         self._end_flipped = end_flipped
+        self._end_unhealthy = end_unhealthy
 
     def reset(self, rng: jax.Array) -> State:
         """A fresh random start, single; vmap it over keys for more."""
@@ -95,7 +98,9 @@ class MujocoEnv(Env):
         control = self._control_center + self._control_span * jnp.clip(action, -1, 1)
         after, derived = self._physics.step(state.pipeline_state, control)
         observation = self.task.observe(after, derived)
-        healthy = self.task.healthy(observation)
+        healthy = jnp.array(True)
+        if self._end_unhealthy:
+            healthy = self.task.healthy(observation)
         if self._end_flipped:
             assert self.task.torso is not None
             healthy &= ~self.task.torso.flipped(observation)

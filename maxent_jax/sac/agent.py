@@ -80,10 +80,22 @@ def restart(sac: Sac, parameters: Parameters) -> Agent:
     return Agent(parameters, sac.optimizer.init(_learned(parameters)))
 
 
-def act(sac: Sac, actor: Any, observation: jax.Array, key: jax.Array) -> jax.Array:
-    """An action drawn from the policy: [..., D] -> [..., A] in [-1, 1]."""
+def act(
+    sac: Sac, actor: Any, observation: jax.Array, key: jax.Array, deterministic: bool = False
+) -> jax.Array:
+    """An action drawn from the policy, or its mean: [..., D] -> [..., A] in [-1, 1]."""
     mean, log_std = _policy(sac, actor, sac.inputs(observation))
+    if deterministic:
+        return jnp.tanh(mean)
     return jnp.tanh(mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape))
+
+
+def value(sac: Sac, parameters: Parameters, observation: jax.Array, key: jax.Array) -> jax.Array:
+    """The critics' estimate of a state's soft value by one action drawn, [..., D] -> [...]."""
+    inputs = sac.inputs(observation)
+    action, log_prob = losses.sample_action(*_policy(sac, parameters.actor, inputs), key)
+    values = _values(sac, parameters.target_critic, inputs, action)
+    return jnp.min(values, axis=-1) - jnp.exp(parameters.log_temperature) * log_prob
 
 
 def update(sac: Sac, agent: Agent, batch: losses.Batch, key: jax.Array) -> tuple[Agent, Metrics]:
@@ -134,10 +146,7 @@ def _values(sac: Sac, critic: Any, inputs: jax.Array, action: jax.Array) -> jax.
 
 
 def _target(sac: Sac, parameters: Parameters, batch: losses.Batch, key: jax.Array) -> jax.Array:
-    inputs = sac.inputs(batch.next_observation)
-    action, log_prob = losses.sample_action(*_policy(sac, parameters.actor, inputs), key)
-    values = _values(sac, parameters.target_critic, inputs, action)
-    next_value = jnp.min(values, axis=-1) - jnp.exp(parameters.log_temperature) * log_prob
+    next_value = value(sac, parameters, batch.next_observation, key)
     return losses.bellman_target(batch, next_value, sac.discount)
 
 

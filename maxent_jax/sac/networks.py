@@ -1,4 +1,4 @@
-"""The actor and the twin critics; the only flax modules of the package."""
+"""Policies, critics, and the networks of the bonuses; the only flax modules of the package."""
 
 from collections.abc import Callable
 
@@ -26,6 +26,29 @@ class Torso(nn.Module):
         return x
 
 
+class Mlp(nn.Module):
+    """[..., I] -> [..., O]: hidden layers of one size, ReLU, and a linear output."""
+
+    num_layers: int
+    size: int
+    output_size: int
+
+    @nn.compact
+    def __call__(self, inputs: jax.Array) -> jax.Array:
+        x = Torso(self.num_layers, self.size, layer_norm=False)(inputs)
+        return nn.Dense(self.output_size)(x)
+
+
+class Trunk(nn.Module):
+    """[..., I] -> [..., F] in [-1, 1]: one layer, normalised, tanh."""
+
+    size: int
+
+    @nn.compact
+    def __call__(self, inputs: jax.Array) -> jax.Array:
+        return nn.tanh(nn.LayerNorm()(nn.Dense(self.size)(inputs)))
+
+
 class Actor(nn.Module):
     """[..., I] -> mean and log standard deviation, [..., A] each, of the action before its tanh."""
 
@@ -38,6 +61,23 @@ class Actor(nn.Module):
         x = Torso(self.num_layers, self.size, layer_norm=False)(inputs)
         mean, log_std = jnp.split(nn.Dense(2 * self.action_size)(x), 2, axis=-1)
         return mean, jnp.clip(log_std, *LOG_STD_RANGE)
+
+
+class GaussianPolicy(nn.Module):
+    """[..., I] -> mean, 0 at first, and log standard deviation, one for all states, [..., A]."""
+
+    action_size: int
+    num_layers: int
+    size: int
+    initial_log_std: float
+
+    @nn.compact
+    def __call__(self, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        x = Torso(self.num_layers, self.size, layer_norm=False)(inputs)
+        mean = nn.Dense(self.action_size, kernel_init=nn.initializers.zeros)(x)
+        initial = nn.initializers.constant(self.initial_log_std)
+        log_std = self.param("log_std", initial, (self.action_size,))
+        return mean, jnp.broadcast_to(log_std, mean.shape)
 
 
 class Critic(nn.Module):

@@ -1,0 +1,136 @@
+"""The figures of a reproduction, from values and runs alone."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments.raw import RANDOM
+from experiments.statistics import interval_of_curves
+from maxent_jax import plotting
+from maxent_jax.analysis import load_run, paths
+from maxent_jax.density import histogram
+
+AXES = (
+    ("iteration", "iteration", 1),
+    ("env_steps", "thousand env steps", 1e-3),
+    ("gradient_steps", "thousand gradient steps", 1e-3),
+    ("wall_seconds", "wall-clock (minutes)", 1 / 60),
+)
+QUANTITIES = (
+    ("cumulative_coverage", "cells, training so far"),
+    ("cumulative_entropy", "entropy, training so far (nats)"),
+    ("mixture_coverage", "cells, mixture"),
+    ("mixture_entropy", "entropy, mixture (nats)"),
+)
+COLORS = {"V": "#d1495b", "LA": "#edae49", "H": "#1b6ca8", RANDOM: "#7a7a7a"}
+OTHERS = ("#4c956c", "#9a7aa0", "#2f3e46", "#5fa8d3", "#b5651d", "#e07a9f", "#8a9a5b", "#003049")
+
+Columns = Mapping[str, np.ndarray]  # [seeds, iterations] each
+
+
+def weights(by_time: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
+    """Fig. 2: a bar for each policy's weight, oldest first; a panel for each time."""
+    figure = Figure(figsize=(4 * len(by_time), 3.2), layout="constrained")
+    for ax, (title, by_name) in zip(figure.subplots(1, len(by_time)), by_time.items(), strict=True):
+        width = 0.8 / len(by_name)
+        for i, (name, values) in enumerate(by_name.items()):
+            ax.bar(np.arange(len(values)) + (i - 1.5) * width, values, width, label=name)
+        ax.set(title=title, xlabel="policy, oldest first", ylabel="weight")
+    ax.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def classic_weights(found: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """Fig. 3: what the official code plots; its runs beside the random policy from their starts;
+    and fresh runs from rest.
+    """
+    panels = (
+        ("running_entropy", "random_running_entropy", "as published: running mean"),
+        ("density_entropy", "random_from_start_entropy", "the mixture's ten runs, one start"),
+        ("fresh_entropy", "random_fresh_entropy", "a hundred runs from rest"),
+    )
+    figure = Figure(figsize=(13, 3.4 * len(found)), layout="constrained")
+    axes = figure.subplots(len(found), len(panels), squeeze=False, sharey="row")
+    for row, (env, of_env) in zip(axes, found.items(), strict=True):
+        weightings = of_env["weightings"]
+        for ax, (name, random_name, title) in zip(row, panels, strict=True):
+            for color, (weighting, values) in zip(
+                ("#d1495b", "#1b6ca8", "#5fa8d3", "#9a7aa0"), weightings.items(), strict=True
+            ):
+                _band(ax, np.array(values[name]), weighting, color)
+            random = np.concatenate([values[random_name] for values in weightings.values()])
+            _band(ax, random, RANDOM, COLORS[RANDOM])
+            ax.set(xlabel="round", title=f"{env}: {title}")
+            ax.grid(alpha=0.25)
+        row[0].set_ylabel("entropy (nats)")
+    axes[0, 0].legend(frameon=False, fontsize=8)
+    seeds = len(next(iter(weightings.values()))["fresh_entropy"])
+    figure.suptitle(f"MaxEnt-H as published: interquartile mean of {seeds} seeds, 95 % interval")
+    return figure
+
+
+def curves(groups: Sequence[tuple[str, str, Columns]], title: str) -> Figure:
+    """Fig. 4: interquartile means with their intervals against all four axes; rows for each env."""
+    envs = list(dict.fromkeys(env for env, _, _ in groups))
+    rows = [(env, quantity) for env in envs for quantity in QUANTITIES]
+    figure = Figure(figsize=(13, 2.7 * len(rows)), layout="constrained")
+    axes = figure.subplots(len(rows), len(AXES), sharey="row", squeeze=False)
+    colors = _colors([method for _, method, _ in groups])
+    for (env, (name, label)), row in zip(rows, axes, strict=True):
+        for _, method, columns in (group for group in groups if group[0] == env):
+            if name in columns:
+                _draw(row, columns, name, method, colors[method])
+        row[0].set_ylabel(label if len(envs) == 1 else f"{env}: {label}")
+        row[0].set_ylim(bottom=0)
+    for ax, (_, label, _) in zip(axes[-1], AXES, strict=True):
+        ax.set_xlabel(label)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, ncols=6, loc="outside lower center")
+    seeds = max(len(columns["env_steps"]) for _, _, columns in groups)
+    figure.suptitle(f"{title}: interquartile mean of {seeds} seeds, 95 % bootstrap interval")
+    return figure
+
+
+def occupancies(directories: Mapping[str, Path]) -> Figure:
+    """Fig. 5: a row for each method; log-occupancy in training and of the mixture, and paths."""
+    figure = Figure(figsize=(13, 4 * len(directories)), layout="constrained")
+    axes = figure.subplots(len(directories), 3, squeeze=False)
+    for row, (method, directory) in zip(axes, directories.items(), strict=True):
+        run = load_run(directory)
+        visited = run.occupancy()
+        cells = np.asarray(histogram.count(visited.states, run.parts.grid, visited.weight))
+        plotting.draw_occupancy(row[0], run, run.histogram / max(run.histogram.sum(), 1))
+        plotting.draw_occupancy(row[1], run, cells)
+        plotting.draw_paths(row[2], run, paths(visited))
+        for ax, what in zip(row, ("training", "mixture", "a policy a colour"), strict=True):
+            ax.set_title(f"{method}: {what}")
+    return figure
+
+
+def _draw(row: Sequence[Axes], columns: Columns, name: str, method: str, color: str) -> None:
+    middle, low, high = interval_of_curves(columns[name])
+    for ax, (axis, _, factor) in zip(row, AXES, strict=True):
+        ax.grid(alpha=0.25)
+        if method == RANDOM and axis == "gradient_steps":
+            ax.axhline(middle[-1], ls=":", lw=1, color=color)
+            continue
+        x = columns[axis].mean(0) * factor
+        ax.plot(x, middle, "-o", ms=3, color=color, label=method)
+        ax.fill_between(x, low, high, color=color, alpha=0.2, lw=0)
+
+
+def _band(ax: Axes, values: np.ndarray, label: str, color: str) -> None:
+    middle, low, high = interval_of_curves(values)
+    rounds = np.arange(1, len(middle) + 1)
+    ax.plot(rounds, middle, color=color, label=label)
+    ax.fill_between(rounds, low, high, color=color, alpha=0.2, lw=0)
+
+
+def _colors(methods: Sequence[str]) -> dict[str, str]:
+    """By method: the same one in every figure for those of the paper."""
+    others = iter(OTHERS * 2)
+    return {m: COLORS.get(m) or next(others) for m in dict.fromkeys(methods)}

@@ -1,0 +1,221 @@
+"""Studies: the runs that an experiment is made of, and what is left of them to do.
+
+A study is a list of cells, and a cell is a run as `experiments.train` makes them, in a directory of
+its own. All methods of a study have the same env steps and gradient steps, and are measured in the
+same projection. Loads no array library.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from experiments.cli import UsageError
+from maxent_jax import integrity, runs
+from maxent_jax.config import BASELINES, CLASSIC_ENVS, Config, check_choice, preset
+
+STUDY = "study.json"
+VERSION = 1  # of a study's directory
+SCALES = ("toy", "cpu", "paper")
+ETAS = (0.1, 0.01, 0.001)
+
+Changes = dict[str, Any]
+
+
+class Cell(NamedTuple):
+    """One run of a study."""
+
+    method: str  # its name in the figures
+    config: Config
+
+    @property
+    def name(self) -> str:
+        """Of its directory."""
+        method = "".join(c if c.isalnum() or c in ".-" else "_" for c in self.method)
+        first, last = self.config.seed, self.config.seed + self.config.num_seeds - 1
+        return f"{self.config.env}-{method}-{first}" + (f"-{last}" if last > first else "")
+
+
+class Scale(NamedTuple):
+    """How much of a study is run."""
+
+    preset: str
+    num_seeds: int
+    envs: tuple[str, ...]
+    changes: Mapping[str, Any] = MappingProxyType({})  # of the preset, in every cell
+
+
+class Study(NamedTuple):
+    """An experiment."""
+
+    what: str
+    methods: dict[str, Changes]  # of the preset, by name in the figures
+    scales: dict[str, Scale]
+    together: bool = False  # seeds side by side in one run, not each in its own
+    mepol: bool = False  # beside them, at the same env steps
+
+
+TOY = Scale("smoke", 2, ("pendulum",))
+ROBOT = {
+    "toy": TOY,
+    "cpu": Scale("quick", 3, ("ant",)),
+    "paper": Scale("paper", 5, ("ant",)),
+}
+CLASSIC = {
+    "toy": TOY,
+    "cpu": Scale("quick", 10, CLASSIC_ENVS),
+    "paper": Scale("paper", 10, CLASSIC_ENVS),
+}
+THREE: dict[str, Changes] = {name.upper(): {"method": name} for name in ("h", "la", "v")}
+UNSHAPED: Changes = {"shaping": 0.0, "shaping_survives_death": False}
+REFRESHED: dict[str, Changes] = {
+    f"every {period or 'iteration'}": {
+        "reference": "history",
+        "refresh_period": period,
+        "start": "last",
+    }
+    for period in (1, 10, 100, 0)
+}
+
+STUDIES: dict[str, Study] = {
+    "fig4": Study(
+        "H, LA and V, beside a random policy",
+        THREE,
+        ROBOT | {"paper": Scale("paper", 5, ("ant", "walker2d", "humanoid"))},
+    ),
+    "weights": Study(
+        "weights of the mixture; all else is V's",
+        {
+            "uniform": {"weights": "uniform"},
+            **{f"η = {eta}": {"weights": "geometric", "eta": eta} for eta in ETAS},
+            "fully corrective": {"weights": "fully_corrective"},
+        },
+        ROBOT,
+    ),
+    "refresh": Study("steps between refreshes of LA's reward", REFRESHED, ROBOT),
+    "refresh_classic": Study(
+        "steps between refreshes of LA's reward", REFRESHED, CLASSIC, together=True
+    ),
+    "start": Study(
+        "the agent that V's iterations start from",
+        {start: {"start": start} for start in ("scratch", "last", "best")},
+        ROBOT,
+    ),
+    "episodic": Study(
+        "weight of the episodic term",
+        {f"λ = {weight}": {"episodic_weight": weight} for weight in (0.0, 0.01, 0.1, 1.0)},
+        ROBOT,
+    ),
+    "form": Study(
+        "form of the reward",
+        {form: {"reward": form} for form in ("log1p", "linear", "log", "paper")},
+        ROBOT,
+    ),
+    "stale": Study(
+        "stored rewards, of the current reference or of their time",
+        {"recomputed": {}, "stale": {"stale_rewards": True}},
+        ROBOT,
+    ),
+    "termination": Study(
+        "what ends an episode",
+        {
+            "health and flips": {"end_flipped": True},
+            "health": {"end_flipped": False},
+            "nothing": {"end_flipped": False, "end_unhealthy": False},
+        },
+        ROBOT | {"toy": TOY._replace(envs=("ant",))},
+    ),
+    "published": Study(
+        "H and LA as published, and as the paper reads them, none of them shaped",
+        {
+            **{name: changes | UNSHAPED for name, changes in THREE.items()},
+            "H, official": {"method": "h-official"},
+            "APT": {"method": "apt"},
+        },
+        ROBOT,
+    ),
+    "baselines": Study(
+        "rewards that the field compares with, one policy each, and V",
+        {"V": {"method": "v"}, **{name: {"method": name} for name in BASELINES}},
+        CLASSIC | {"cpu": Scale("quick", 10, ("pendulum",), {"num_iterations": 2})},
+        together=True,
+        mepol=True,
+    ),
+}
+
+
+def make(study: str, scale: str, num_seeds: int | None = None) -> list[Cell]:
+    """The cells of a study, all methods of a seed before the next seed.
+
+    Raises:
+      ConfigError, UsageError: an unknown study or scale, or no seeds.
+    """
+    check_choice("study", study, STUDIES)
+    check_choice("scale", scale, SCALES)
+    chosen = STUDIES[study]
+    at = chosen.scales[scale]
+    seeds = at.num_seeds if num_seeds is None else num_seeds
+    if seeds < 1:
+        raise UsageError(f"seeds is {seeds}, but a study needs at least 1.")
+    width = seeds if chosen.together else 1
+    return [
+        Cell(
+            method,
+            preset(
+                at.preset,
+                **{"env": env, "seed": seed, "num_seeds": width, **at.changes, **changes},
+            ),
+        )
+        for seed in range(0, seeds, width)
+        for env in at.envs
+        for method, changes in chosen.methods.items()
+    ]
+
+
+def claim(directory: Path, study: str, scale: str, cells: list[Cell]) -> None:
+    """Makes the study's directory, or sees that it is this study's; more seeds may be added.
+
+    Raises:
+      UsageError: it holds another study, or this one with other settings.
+    """
+    path = directory / STUDY
+    content = runs.jsonable(
+        {
+            "version": VERSION,
+            "study": study,
+            "scale": scale,
+            "cells": {cell.name: dataclasses.asdict(cell.config) for cell in cells},
+        }
+    )
+    if path.exists():
+        try:
+            held = json.loads(path.read_text())
+            differs = _difference(held, content)
+        except (ValueError, KeyError, TypeError, AttributeError):
+            differs = f"its {STUDY} cannot be read"
+        if differs:
+            raise UsageError(f"{directory} holds another study: {differs}; choose another --out.")
+        content["cells"] = held["cells"] | content["cells"]
+    elif directory.exists() and any(directory.iterdir()):
+        raise UsageError(f"{directory} is no study's, and not empty: choose another --out.")
+    runs.write_json(path, content)
+
+
+def _difference(held: Changes, asked: Changes) -> str:
+    for what in ("version", "study", "scale"):
+        if held[what] != asked[what]:
+            return f"{what} is {held[what]}, not {asked[what]}"
+    for name, config in asked["cells"].items():
+        for field, value in config.items():
+            was = held["cells"].get(name, config).get(field, value)
+            if was != value:
+                return f"in {name}, {field} was {was} and is {value}"
+    return ""
+
+
+def finished(directory: Path, cell: Cell) -> bool:
+    """Whether the cell's run is complete and saved."""
+    names = integrity.checkpoints(directory / cell.name)
+    return names[-1:] == [f"{cell.config.num_iterations}"]

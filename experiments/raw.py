@@ -1,0 +1,78 @@
+"""The raw values of a study's runs: a row for each seed and iteration, and CSV files of them."""
+
+import csv
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.protocol import Cell
+from maxent_jax import runs
+
+MEASURED = ("coverage", "entropy", "off_grid_share")
+COLUMNS = (
+    *("env", "method", "seed", "iteration", "env_steps", "gradient_steps", "wall_seconds"),
+    *(f"cumulative_{name}" for name in MEASURED),
+    *(f"mixture_{name}" for name in (*MEASURED, "knn_entropy")),
+    *("effective_policies", "evaluation_episode_length", "num_rollout_steps"),
+)
+RANDOM = "random policy"
+
+Row = dict[str, Any]
+
+
+def read(directory: Path, cells: Sequence[Cell]) -> list[Row]:
+    """Of all cells, and of the random policy beside the first method's runs."""
+    found = []
+    first = cells[0].method
+    for cell in cells:
+        for row in runs.read_metrics(directory / cell.name):
+            for index in range(cell.config.num_seeds):
+                found.append(_of_seed(cell, row, index))
+                if cell.method == first and "random_coverage" in row:
+                    found.append(_of_random(cell, row, index))
+    return sorted(found, key=lambda row: (row["env"], row["method"] == RANDOM))
+
+
+def write(path: Path, rows: Sequence[Row]) -> None:
+    """As CSV, whole or not at all."""
+    with runs.whole_file(path) as temporary, open(temporary, "w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def groups(rows: Sequence[Row]) -> Iterator[tuple[str, str, dict[str, np.ndarray]]]:
+    """Environment, method, and columns [seeds, iterations] of what every row of theirs has."""
+    names = dict.fromkeys((row["env"], row["method"]) for row in rows)
+    for env, method in names:
+        own = [row for row in rows if (row["env"], row["method"]) == (env, method)]
+        seeds = sorted({row["seed"] for row in own})
+        ordered = [[row for row in own if row["seed"] == seed] for seed in seeds]
+        columns = [name for name in COLUMNS[3:] if all(name in row for row in own)]
+        yield (
+            env,
+            method,
+            {c: np.array([[row[c] for row in of_seed] for of_seed in ordered]) for c in columns},
+        )
+
+
+def _of_seed(cell: Cell, row: Row, index: int) -> Row:
+    def value(name: str) -> Any:
+        return row[name][index] if isinstance(row[name], list) else row[name]
+
+    found = {name: value(name) for name in COLUMNS[3:] if name in row}
+    return _head(cell, index) | found
+
+
+def _of_random(cell: Cell, row: Row, index: int) -> Row:
+    whole = _of_seed(cell, row, index)
+    kept = {name: whole[name] for name in ("iteration", "env_steps", "wall_seconds")}
+    renamed = {f"cumulative_{name}": row[f"random_{name}"] for name in MEASURED}
+    picked = {k: v[index] if isinstance(v, list) else v for k, v in renamed.items()}
+    return _head(cell, index) | {"method": RANDOM, "gradient_steps": 0} | kept | picked
+
+
+def _head(cell: Cell, index: int) -> Row:
+    return {"env": cell.config.env, "method": cell.method, "seed": cell.config.seed + index}

@@ -1,0 +1,137 @@
+"""Reproduces the paper's figures, put right, and runs the ablations that its readers asked for.
+
+A study's directory holds study.json, a run for each of its cells and, once all are finished,
+raw.csv, summary.json and its figure. Killed and started again, it goes on with what is left;
+several processes may share a directory, and machines that share none may share the cells.
+"""
+
+import dataclasses
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from experiments import cli, protocol, train
+from experiments.protocol import Cell
+from maxent_jax.config import check_choice
+
+# What a figure of the paper is made of: studies, by name.
+FIGURES = {"fig2": (), "fig3": ("weights",), "fig4": ("fig4",), "fig5": ("fig4",)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Reproduce a figure of the paper, or run a study."""
+
+    what: Annotated[str, tyro.conf.Positional]
+    """fig2, fig3, fig4, fig5, all of these (all), or the name of a study."""
+    scale: str = "cpu"
+    """toy (does it run?), cpu (two cores), or paper (the paper's settings, for accelerators)."""
+    out: Path = Path("studies")
+    """Where every study and figure has its directory."""
+    seeds: int | None = None
+    """Of each method; as many as the scale says if left out."""
+    jobs: int = 1
+    """Processes that share the cells and the cores of this machine."""
+    shard: str = "0/1"
+    """I/N: the cells I, I + N, I + 2N, ... alone, for arrays of jobs."""
+    figures: bool = True
+    """Draw, once all cells are finished."""
+
+
+def main(argv: Sequence[str]) -> None:
+    """Parses and checks, and only then trains."""
+    arguments = cli.parse(Arguments, argv, "experiments.reproduce")
+    index, count = _check(arguments)
+    studies = {
+        name: protocol.make(name, arguments.scale, arguments.seeds)
+        for name in _studies(arguments.what)
+    }
+    for name, cells in studies.items():
+        protocol.claim(arguments.out / name, name, arguments.scale, cells)
+    if arguments.jobs > 1:
+        _share(arguments)
+    else:
+        for name, cells in studies.items():
+            _train(arguments.out / name, cells[index::count])
+    left = [
+        f"{name}/{cell.name}"
+        for name, cells in studies.items()
+        for cell in cells
+        if not protocol.finished(arguments.out / name, cell)
+    ]
+    if left:
+        print(f"{len(left)} cells are not finished, {left[0]} the first: no figures yet.")
+    elif arguments.figures:
+        from experiments import reproduced  # loads jax
+        from maxent_jax import runtime
+
+        runtime.prepare(simulates_in_jax=False)
+        whats = FIGURES if arguments.what == "all" else (arguments.what,)
+        reproduced.draw(whats, arguments.scale, arguments.seeds, arguments.out, studies)
+
+
+def _check(arguments: Arguments) -> tuple[int, int]:
+    """The shard."""
+    if arguments.what not in (*FIGURES, "all", *protocol.STUDIES):
+        check_choice("study", arguments.what, ("all", *FIGURES, *protocol.STUDIES))
+    check_choice("scale", arguments.scale, protocol.SCALES)
+    if arguments.seeds is not None and arguments.seeds < 1:
+        raise cli.UsageError(f"seeds is {arguments.seeds}, but a study needs at least 1.")
+    if arguments.jobs < 1:
+        raise cli.UsageError(f"jobs is {arguments.jobs}, but must be at least 1.")
+    index, slash, count = arguments.shard.partition("/")
+    if not (slash and index.isdigit() and count.isdigit() and int(index) < int(count)):
+        raise cli.UsageError(f"shard is {arguments.shard}, but must be I/N with 0 <= I < N.")
+    if arguments.out.is_file():
+        raise cli.UsageError(f"out {arguments.out} is a file: name a folder.")
+    return int(index), int(count)
+
+
+def _studies(what: str) -> tuple[str, ...]:
+    if what == "all":
+        return tuple(dict.fromkeys(name for names in FIGURES.values() for name in names))
+    return FIGURES.get(what, (what,))
+
+
+def _train(directory: Path, cells: Sequence[Cell]) -> None:
+    """What is left of the cells; those that another process trains are passed over."""
+    for cell in cells:
+        if protocol.finished(directory, cell):
+            continue
+        started = time.perf_counter()
+        arguments = train.Arguments(cell.config, out=directory / cell.name, resume=True)
+        try:
+            with train.claimed(arguments):
+                from experiments import driver  # loads jax
+
+                driver.train(cell.config, arguments.directory, started)
+        except train.BusyError:
+            continue
+
+
+def _share(arguments: Arguments) -> None:
+    """As many processes as jobs, each on its share of the cores, until all have ended."""
+    command = [sys.executable, "-m", "experiments.reproduce", arguments.what, "--no-figures"]
+    for name in ("scale", "out", "seeds", "shard"):
+        value = getattr(arguments, name)
+        command += [] if value is None else [f"--{name}", str(value)]
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    processes = []
+    for i in range(arguments.jobs):
+        processes.append(subprocess.Popen(command))
+        if cores:  # before its threads start, which inherit it
+            mine = cores[i :: arguments.jobs] or cores
+            os.sched_setaffinity(processes[-1].pid, mine)
+    codes = [process.wait() for process in processes]
+    if any(codes):
+        raise cli.UsageError(f"{sum(map(bool, codes))} of {len(codes)} jobs failed: see above.")
+
+
+if __name__ == "__main__":
+    cli.entry_point(main)()

@@ -1,0 +1,127 @@
+"""From finished studies to figures, tables and summaries."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments import classic_weights, mepol_rows, paper_figures, protocol, raw, statistics
+from experiments.protocol import Cell
+from maxent_jax import mixture, plotting, runs
+
+FIG2_TIMES = (5, 10, 20)
+SUMMARISED = (
+    *("cumulative_coverage", "cumulative_entropy"),
+    *("mixture_coverage", "mixture_entropy", "mixture_knn_entropy"),
+)
+
+
+def draw(
+    whats: Iterable[str],
+    scale: str,
+    num_seeds: int | None,
+    out: Path,
+    studies: Mapping[str, Sequence[Cell]],
+) -> None:
+    """Figures and studies by name, into directories of theirs; prints each file and table."""
+    for what in whats:
+        if what == "fig2":
+            fig2(out / "fig2")
+        elif what == "fig3":
+            fig3(out / "fig3", scale, num_seeds)
+            study(out / "weights", "weights", studies["weights"])
+        elif what == "fig5":
+            fig5(out / "fig5", out / "fig4", studies["fig4"])
+        else:
+            study(out / what, what, studies[what])
+
+
+def fig2(directory: Path) -> None:
+    """The mixture's weights, exactly."""
+    weights = {
+        f"t = {time}": {"uniform": mixture.uniform_weights(time)}
+        | {f"η = {eta}": mixture.geometric_weights(time, eta) for eta in protocol.ETAS}
+        for time in FIG2_TIMES
+    }
+    runs.write_json(directory / "weights.json", weights)
+    _save(paper_figures.weights(weights), directory, "fig2")
+    print(f"{directory / 'weights.json'}")
+
+
+def fig3(directory: Path, scale: str, num_seeds: int | None) -> None:
+    """Weights in the classic environments with the official settings; Ant's are a study."""
+    found = classic_weights.results(directory, scale, num_seeds)
+    table = classic_weights.table(found)
+    runs.write_json(directory / "summary.json", dict(table))
+    _save(paper_figures.classic_weights(found), directory, "fig3")
+    _print("uniform", table)
+    print(f"{directory / classic_weights.RESULTS}, {directory / 'summary.json'}")
+
+
+def study(directory: Path, name: str, cells: Sequence[Cell]) -> None:
+    """raw.csv, summary.json and the curves of a study, and its table."""
+    rows = raw.read(directory, cells)
+    if protocol.STUDIES[name].mepol:
+        ours = [cell for cell in cells if cell.method == cells[0].method]
+        for config in (cell.config for cell in ours):
+            rows += mepol_rows.rows(directory / config.env, config, config.num_seeds)
+    raw.write(directory / "raw.csv", rows)
+    groups = list(raw.groups(rows))
+    summary = summarise(groups)
+    runs.write_json(directory / "summary.json", {"study": name, "what": _what(name)} | summary)
+    _save(paper_figures.curves(groups, _what(name)), directory, name)
+    _print(summary["compared_with"], summary["last_iteration"])
+    print(f"{directory / 'raw.csv'}, {directory / 'summary.json'}")
+
+
+def fig5(directory: Path, trained: Path, cells: Sequence[Cell]) -> None:
+    """Where the first seed of each method went: in training, by the mixture, and each policy."""
+    for env in dict.fromkeys(cell.config.env for cell in cells):
+        chosen = [c for c in cells if c.config.env == env and c.config.seed == 0]
+        figure = paper_figures.occupancies({c.method: trained / c.name for c in chosen})
+        _save(figure, directory, f"fig5_{env}")
+
+
+def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[str, Any]:
+    """The last iteration: interquartile means, intervals, and how likely V, or the first method,
+    is to be better than each other.
+    """
+    last: dict[str, dict[str, dict[str, np.ndarray]]] = {}
+    for env, method, columns in groups:
+        for name in SUMMARISED:
+            if name in columns:
+                last.setdefault(name, {}).setdefault(method, {})[env] = columns[name][:, -1]
+    names = list(dict.fromkeys(method for _, method, _ in groups))
+    ours = "V" if "V" in names else names[0]
+    return {
+        "compared_with": ours,
+        "seeds": len(next(iter(groups))[2]["env_steps"]),
+        "last_iteration": {
+            name: statistics.compare(
+                {method: list(of_env.values()) for method, of_env in by_method.items()}, ours
+            )
+            for name, by_method in last.items()
+        },
+    }
+
+
+def _what(name: str) -> str:
+    return protocol.STUDIES[name].what
+
+
+def _print(ours: str, table: Mapping[str, Mapping[str, Any]]) -> None:
+    for name, by_method in table.items():
+        print(f"{name}, interquartile mean [95 %], P({ours} is better)")
+        for method, found in by_method.items():
+            low, high = found["interval"]
+            text = f"  {method:18} {found['interquartile_mean']:9.2f} [{low:.2f}, {high:.2f}]"
+            if "probability_of_improvement" in found:
+                low, high = found["probability_interval"]
+                text += f"  {found['probability_of_improvement']:.2f} [{low:.2f}, {high:.2f}]"
+            print(text)
+
+
+def _save(figure: Figure, directory: Path, name: str) -> None:
+    print(plotting.save(figure, directory, name))

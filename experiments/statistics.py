@@ -1,0 +1,91 @@
+"""What a few seeds say: interquartile mean, stratified bootstrap, probability of improvement.
+
+After Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice",
+arXiv 2108.13264. Scores are lists of arrays, one array of seeds for each task.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+Scores = Sequence[np.ndarray]
+RESAMPLES = 2000
+CONFIDENCE = 0.95
+
+
+def interquartile_mean(scores: Scores) -> float:
+    """The mean of the middle half of all runs of all tasks, which no single run can move far."""
+    return float(stats.trim_mean(np.concatenate(scores), 0.25))
+
+
+def probability_of_improvement(ours: Scores, theirs: Scores) -> float:
+    """How likely a run of ours is to beat one of theirs on the same task, ties counted half.
+
+    Raises:
+      ValueError: different numbers of tasks.
+    """
+    each = [
+        stats.mannwhitneyu(x, y).statistic / (len(x) * len(y))
+        for x, y in zip(ours, theirs, strict=True)
+    ]
+    return float(np.mean(each))
+
+
+def interval(
+    statistic: Callable[..., float], *scores: Scores, seed: int = 0, resamples: int = RESAMPLES
+) -> tuple[float, float]:
+    """The 95 % percentile interval of a statistic by stratified bootstrap.
+
+    The seeds of each task, of each of the scores, are drawn anew with replacement; tasks stay.
+
+    Args:
+      statistic: of as many scores as are given.
+      scores: not empty; with one seed a task the interval is a point, and says nothing.
+    Raises:
+      ValueError: a task without seeds.
+    """
+    if any(len(of_task) == 0 for some in scores for of_task in some):
+        raise ValueError("each task needs at least one seed")
+    random = np.random.default_rng(seed)
+    found = [
+        statistic(*([random.choice(x, len(x)) for x in some] for some in scores))
+        for _ in range(resamples)
+    ]
+    outside = 50 * (1 - CONFIDENCE)
+    low, high = np.percentile(found, [outside, 100 - outside])
+    return float(low), float(high)
+
+
+def interval_of_curves(curves: np.ndarray, seed: int = 0) -> tuple[np.ndarray, ...]:
+    """Interquartile mean of curves [N, T] at each time, and its interval: three arrays [T].
+
+    Whole curves are drawn, so that neighbouring times rise and fall together.
+    """
+    random = np.random.default_rng(seed)
+    rows = random.integers(len(curves), size=(RESAMPLES, len(curves)))
+    found = stats.trim_mean(curves[rows], 0.25, axis=1)  # [resamples, T]
+    outside = 50 * (1 - CONFIDENCE)
+    low, high = np.percentile(found, [outside, 100 - outside], axis=0)
+    return stats.trim_mean(curves, 0.25, axis=0), low, high
+
+
+def compare(scores: Mapping[str, Scores], ours: str) -> dict[str, dict[str, Any]]:
+    """By name: interquartile mean and interval and, but for `ours` itself, how likely that is to be
+    better, with its interval.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for name, own in scores.items():
+        found[name] = {
+            "interquartile_mean": interquartile_mean(own),
+            "interval": interval(interquartile_mean, own),
+            "values": own,
+        }
+        if name != ours:
+            both = scores[ours], own
+            found[name] |= {
+                "probability_of_improvement": probability_of_improvement(*both),
+                "probability_interval": interval(probability_of_improvement, *both),
+            }
+    return found

@@ -1,0 +1,48 @@
+"""Running mean and variance, batch by batch."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+# What mean 0 and variance 1 weigh before the first batch, as in the code of RND and in URLB.
+PRIOR_WEIGHT = 1e-4
+
+
+class Moments(NamedTuple):
+    """Of everything met so far."""
+
+    mean: jax.Array  # [...]
+    variance: jax.Array  # [...] mean squared deviation
+    weight: jax.Array  # [] float32, how many values that is
+
+
+def init(shape: tuple[int, ...] = ()) -> Moments:
+    """Mean 0 and variance 1, which the first batch replaces."""
+    return Moments(jnp.zeros(shape), jnp.ones(shape), jnp.asarray(PRIOR_WEIGHT, jnp.float32))
+
+
+def update(moments: Moments, batch: jax.Array, valid: jax.Array | None = None) -> Moments:
+    """The moments with a batch merged into them.
+
+    Args:
+      moments: [...].
+      batch: [B, ...].
+      valid: [B] bool, the rows that count; all of them when left out.
+    Source: Chan, Golub & LeVeque 1979, the pairwise update of sums of squares.
+    """
+    valid = jnp.ones(batch.shape[0], bool) if valid is None else valid
+    rows = valid.reshape(-1, *[1] * (batch.ndim - 1))
+    weight = jnp.sum(valid, dtype=jnp.float32)
+    mean = jnp.sum(jnp.where(rows, batch, 0.0), axis=0) / jnp.maximum(weight, 1.0)
+    deviation = jnp.where(rows, batch - mean[None], 0.0)
+    variance = jnp.sum(deviation**2, axis=0) / jnp.maximum(weight, 1.0)
+
+    share = weight / (moments.weight + weight)
+    change = mean - moments.mean
+    spread = (1 - share) * moments.variance + share * variance
+    return Moments(
+        mean=moments.mean + share * change,
+        variance=spread + share * (1 - share) * change**2,
+        weight=moments.weight + weight,
+    )

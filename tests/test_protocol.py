@@ -1,0 +1,262 @@
+"""Studies: equal budgets and one projection for all methods, and no finished cell twice."""
+
+import csv
+import dataclasses
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from experiments import cli, driver, protocol, raw, reproduce
+from experiments.protocol import Cell
+from maxent_jax import runs
+from maxent_jax.config import ConfigError, preset
+from maxent_jax.features import make_feature_map
+
+TOY = ["--scale", "toy", "--seeds", "1"]
+ALL = [(name, scale) for name in protocol.STUDIES for scale in protocol.SCALES]
+
+
+@pytest.mark.parametrize(("name", "scale"), ALL)
+def test_all_methods_of_a_study_have_one_budget_and_one_environment(name, scale):
+    cells = protocol.make(name, scale)
+    assert len({cell.name for cell in cells}) == len(cells)
+    for env in {cell.config.env for cell in cells}:
+        own = [cell for cell in cells if cell.config.env == env]
+        budgets = {
+            (
+                c.steps_per_iteration * c.num_iterations,
+                c.vector_steps * c.num_segments * c.num_iterations * c.updates_per_vector_step,
+                c.mixture_episodes * c.episode_length,
+                c.batch_size,
+            )
+            for c in (cell.config for cell in own)
+        }
+        assert len(budgets) == 1
+        seeds = {
+            method: sorted(
+                seed
+                for cell in own
+                if cell.method == method
+                for seed in range(cell.config.seed, cell.config.seed + cell.config.num_seeds)
+            )
+            for method in {cell.method for cell in own}
+        }
+        assert len({tuple(of_method) for of_method in seeds.values()}) == 1
+
+
+@pytest.mark.parametrize("name", protocol.STUDIES)
+def test_all_methods_of_a_study_share_one_projection(name):
+    from maxent_jax import parts
+
+    # The map has no other argument than the environment's name: no method, seed or setting.
+    for cell in protocol.make(name, "toy"):
+        assert parts.make(cell.config).phi == make_feature_map(cell.config.env)
+
+
+def test_fewer_seeds_are_a_part_of_the_study():
+    whole, part = protocol.make("fig4", "cpu"), protocol.make("fig4", "cpu", 2)
+    assert part == whole[: len(part)]
+
+
+@pytest.mark.parametrize(
+    ("argv", "sentence"),
+    [
+        (["fig9"], "did you mean 'fig"),
+        (["stael"], "did you mean 'stale'"),
+        (["fig4", "--scale", "cpus"], "did you mean 'cpu'"),
+        (["fig4", "--seeds", "0"], "at least 1"),
+        (["fig4", "--jobs", "0"], "at least 1"),
+        (["fig4", "--shard", "2/2"], "0 <= I < N"),
+        (["fig4", "--shard", "half"], "0 <= I < N"),
+    ],
+)
+def test_bad_input_is_one_sentence_before_anything_is_written(tmp_path, argv, sentence):
+    with pytest.raises((cli.UsageError, ConfigError), match=sentence) as error:
+        reproduce.main([*argv, "--out", str(tmp_path / "studies")])
+    assert "\n" not in str(error.value)
+    assert not (tmp_path / "studies").exists()
+
+
+def test_bad_input_is_met_without_jax():
+    code = (
+        "import sys; from experiments import cli, reproduce\n"
+        "try: reproduce.main(['fig4', '--seeds', '0'])\n"
+        "except cli.UsageError: sys.exit('jax' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True)
+
+
+def test_a_directory_belongs_to_one_study_and_may_gain_seeds(tmp_path):
+    directory = tmp_path / "fig4"
+    one, two = (protocol.make("fig4", "cpu", seeds) for seeds in (1, 2))
+    protocol.claim(directory, "fig4", "cpu", two)
+    protocol.claim(directory, "fig4", "cpu", one)
+    held = json.loads((directory / protocol.STUDY).read_text())
+    assert set(held["cells"]) == {cell.name for cell in two}
+
+    changed = [one[0]._replace(config=dataclasses.replace(one[0].config, eta=0.5))]
+    with pytest.raises(cli.UsageError, match=r"eta was 0\.1 and is 0\.5; choose another --out"):
+        protocol.claim(directory, "fig4", "cpu", changed)
+    with pytest.raises(cli.UsageError, match="scale is cpu, not paper"):
+        protocol.claim(directory, "fig4", "paper", protocol.make("fig4", "paper"))
+    (directory / protocol.STUDY).write_text(json.dumps(held | {"version": 0}))
+    with pytest.raises(cli.UsageError, match="version is 0, not 1"):
+        protocol.claim(directory, "fig4", "cpu", one)
+    (directory / protocol.STUDY).write_text("{")
+    with pytest.raises(cli.UsageError, match="cannot be read"):
+        protocol.claim(directory, "fig4", "cpu", one)
+    with pytest.raises(cli.UsageError, match="not empty"):
+        protocol.claim(tmp_path, "fig4", "cpu", one)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """fig5 at toy size, which needs the runs of fig4, stopped once in the middle; and the calls."""
+    out, trained = tmp_path_factory.mktemp("studies"), []
+    whole = driver.train
+
+    def until_the_second(config, directory, *rest):
+        if len(trained) == 1:
+            raise KeyboardInterrupt
+        trained.append(directory.name)
+        whole(config, directory, *rest)
+
+    def all_of_it(config, directory, *rest):
+        trained.append(directory.name)
+        whole(config, directory, *rest)
+
+    argv = ["fig5", *TOY, "--out", str(out)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(driver, "train", until_the_second)
+        with pytest.raises(KeyboardInterrupt):
+            reproduce.main(argv)
+        patch.setattr(driver, "train", all_of_it)
+        reproduce.main(argv)
+        reproduce.main(["fig4", *TOY, "--out", str(out)])
+    return out, trained
+
+
+def test_a_stopped_study_repeats_no_finished_cell(finished):
+    _, trained = finished
+    assert trained == [cell.name for cell in protocol.make("fig4", "toy", 1)]
+
+
+def test_the_raw_values_are_those_of_the_runs(finished):
+    out, _ = finished
+    with open(out / "fig4" / "raw.csv") as file:
+        rows = list(csv.DictReader(file))
+    cells = protocol.make("fig4", "toy", 1)
+    iterations = cells[0].config.num_iterations
+    assert len(rows) == (len(cells) + 1) * iterations  # and the random policy
+    for cell in cells:
+        kept = runs.read_metrics(out / "fig4" / cell.name)
+        own = [
+            row
+            for row in rows
+            if (row["method"], row["seed"]) == (cell.method, str(cell.config.seed))
+        ]
+        for row, metrics in zip(own, kept, strict=True):
+            assert float(row["mixture_entropy"]) == metrics["mixture_entropy"]
+            assert int(row["cumulative_coverage"]) == metrics["cumulative_coverage"]
+    random = [row for row in rows if row["method"] == raw.RANDOM]
+    assert {row["gradient_steps"] for row in random} == {"0"}
+
+
+def test_the_summary_is_of_the_last_iteration(finished):
+    out, _ = finished
+    summary = json.loads((out / "fig4" / "summary.json").read_text())
+    assert summary["compared_with"] == "V"
+    for method in ("H", "LA", "V"):
+        last = [
+            runs.read_metrics(out / "fig4" / cell.name)[-1]["cumulative_coverage"]
+            for cell in protocol.make("fig4", "toy", 1)
+            if cell.method == method
+        ]
+        found = summary["last_iteration"]["cumulative_coverage"][method]
+        assert found["values"] == [last]
+        assert found["interquartile_mean"] == last[0]
+        assert ("probability_of_improvement" in found) == (method != "V")
+    assert (out / "fig4" / "fig4.png").stat().st_size > 10_000
+    assert (out / "fig5" / "fig5_pendulum.png").stat().st_size > 10_000
+
+
+def test_cumulative_coverage_never_falls_in_any_run(finished):
+    out, _ = finished
+    for cell in protocol.make("fig4", "toy", 1):
+        rows = runs.read_metrics(out / "fig4" / cell.name)
+        coverage = [row["cumulative_coverage"] for row in rows]
+        assert coverage == sorted(coverage) and coverage[0] > 0
+
+
+def test_seeds_side_by_side_are_told_apart(tmp_path):
+    cell = Cell("V", preset("smoke", env="pendulum", seed=3, num_seeds=2))
+    row = {name: [1.0, 2.0] for name in raw.COLUMNS[3:]} | {"env_steps": 7}
+    row |= {f"random_{name}": [5, 6] for name in raw.MEASURED}
+    (tmp_path / cell.name).mkdir()
+    runs.append_metrics(tmp_path / cell.name, row)
+    found = raw.read(tmp_path, [cell])
+    assert [(r["seed"], r["method"], r["cumulative_coverage"]) for r in found] == [
+        (3, "V", 1.0),
+        (4, "V", 2.0),
+        (3, raw.RANDOM, 5),
+        (4, raw.RANDOM, 6),
+    ]
+
+
+def test_fig2_is_what_a_solver_of_quadratic_programs_finds(tmp_path):
+    from scipy import optimize
+
+    reproduce.main(["fig2", "--scale", "toy", "--out", str(tmp_path)])
+    weights = json.loads((tmp_path / "fig2" / "weights.json").read_text())
+    assert set(weights) == {"t = 5", "t = 10", "t = 20"}
+    for title, by_name in weights.items():
+        n = int(title.split()[-1])
+        np.testing.assert_allclose(by_name["uniform"], 1 / n)
+        for eta in protocol.ETAS:
+            target = (1 - eta) ** (n - np.arange(n))
+            solved = optimize.minimize(
+                lambda x, target=target: ((x - target) ** 2).sum(),
+                np.full(n, 1 / n),
+                jac=lambda x, target=target: 2 * (x - target),
+                bounds=[(0, None)] * n,
+                constraints={"type": "eq", "fun": lambda x: x.sum() - 1},
+                method="SLSQP",
+                options={"ftol": 1e-15, "maxiter": 500},
+            )
+            np.testing.assert_allclose(by_name[f"η = {eta}"], solved.x, atol=1e-6)
+    assert (tmp_path / "fig2" / "fig2.png").exists()
+
+
+def test_mepol_has_the_env_steps_of_the_study_and_is_computed_once(tmp_path, monkeypatch):
+    from experiments import mepol_rows
+
+    config = preset("smoke", env="pendulum", num_seeds=2)
+    found = mepol_rows.rows(tmp_path, config, 2)
+    assert [(row["seed"], row["iteration"], row["env_steps"]) for row in found] == [
+        (seed, i, i * config.steps_per_iteration) for i in (1, 2) for seed in (0, 1)
+    ]
+    assert {row["method"] for row in found} == {mepol_rows.METHOD}
+    monkeypatch.setattr(mepol_rows, "_train", None)  # a second time would fail
+    assert mepol_rows.rows(tmp_path, config, 2) == found
+    with pytest.raises(TypeError):
+        mepol_rows.rows(tmp_path, config, 1)
+
+
+def test_the_weights_of_the_classic_environments_are_computed_once(tmp_path, monkeypatch):
+    from experiments import classic_weights
+
+    found = classic_weights.results(tmp_path, "toy", 1)
+    assert set(found) == {"pendulum", "mountain_car"}
+    for of_env in found.values():
+        assert list(of_env["weightings"]) == ["uniform", "η = 0.1", "η = 0.01", "η = 0.001"]
+        runs_of = [np.array(values["fresh_entropy"]) for values in of_env["weightings"].values()]
+        assert all(values.shape == (1, 3) and np.isfinite(values).all() for values in runs_of)
+        np.testing.assert_array_equal(runs_of[0][:, 0], runs_of[1][:, 0])  # one policy, one weight
+    table = classic_weights.table(found)
+    assert "probability_of_improvement" not in table["pendulum, fresh_entropy"]["uniform"]
+    assert 0 <= table["pendulum, fresh_entropy"]["η = 0.1"]["probability_of_improvement"] <= 1
+    monkeypatch.setattr(classic_weights, "_run", None)
+    assert classic_weights.results(tmp_path, "toy", 1) == found
