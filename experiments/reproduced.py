@@ -31,7 +31,6 @@ def draw(
             fig2(out / "fig2")
         elif what == "fig3":
             fig3(out / "fig3", scale, num_seeds)
-            study(out / "weights", "weights", studies["weights"])
         elif what == "fig5":
             fig5(out / "fig5", out / "fig4", studies["fig4"])
         else:

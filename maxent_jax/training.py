@@ -230,10 +230,12 @@ def _learn(
         drawn.outcomes,
     )
     outcomes = drawn.outcomes._replace(distances=distances)
+    of_bonus: Metrics = {}
     if parts.bonus is None:
         bonus, paid = learner.bonus, reward(parts, outcomes)
     else:
-        bonus, paid = _paid_by_bonus(parts, learner, drawn, jax.random.fold_in(key, 2))
+        key_bonus = jax.random.fold_in(key, 2)
+        bonus, paid, of_bonus = _paid_by_bonus(parts, learner, drawn, key_bonus)
     total, beyond = returns(outcomes, paid, config.discount)
     batches = losses.Batch(drawn.observation, drawn.action, total, drawn.next_observation, beyond)
 
@@ -242,7 +244,7 @@ def _learn(
 
     keys = jax.random.split(key_update, shape[0])
     agent, metrics = jax.lax.scan(update, learner.agent, (batches, keys))
-    metrics = jax.tree.map(jnp.mean, metrics)
+    metrics = jax.tree.map(jnp.mean, metrics | of_bonus)
     metrics |= {
         "replay_reward": jnp.mean(unshaped_reward(parts, distances.reached[..., 0])),
         "replay_paid": jnp.mean(paid[..., 0]),
@@ -253,8 +255,9 @@ def _learn(
 
 def _paid_by_bonus(
     parts: Parts, learner: Learner, drawn: Experience, key: jax.Array
-) -> tuple[Any, jax.Array]:
-    """The bonus once it has learned from what was drawn, and what it paid for it before, [..., 1].
+) -> tuple[Any, jax.Array, Metrics]:
+    """The bonus once it has learned from what was drawn, what it paid for it before, [..., 1], and
+    what it says of itself.
 
     It sees features, as every other reward does.
     """
@@ -274,11 +277,11 @@ def _paid_by_bonus(
     bonus, paid = payer.reward(learner.bonus, together, key_reward)
 
     def learn(bonus, batch_and_key):
-        return payer.learn(bonus, *batch_and_key)[0], None
+        return payer.learn(bonus, *batch_and_key)
 
     keys = jax.random.split(key_learn, steps.value.shape[0])
-    bonus, _ = jax.lax.scan(learn, bonus, (steps, keys))
-    return bonus, parts.config.reward_scale * paid.reshape(*steps.value.shape, 1)
+    bonus, metrics = jax.lax.scan(learn, bonus, (steps, keys))
+    return bonus, parts.config.reward_scale * paid.reshape(*steps.value.shape, 1), metrics
 
 
 def _cells(parts: Parts, states: jax.Array) -> jax.Array:
