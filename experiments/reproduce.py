@@ -20,8 +20,8 @@ from experiments import cli, protocol, train
 from experiments.protocol import Cell
 from maxent_jax.config import check_choice
 
-# What a figure of the paper is made of: studies, by name. Fig. 3's other half, weights on Ant, takes
-# longer on a CPU than all the rest: it is the study `weights`.
+# What a figure of the paper is made of: studies, by name. Fig. 3's other half, weights on Ant, is
+# the study `weights`: on a CPU it takes longer than all the rest.
 FIGURES: dict[str, tuple[str, ...]] = {
     "fig2": (),
     "fig3": (),
