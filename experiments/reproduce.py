@@ -71,7 +71,7 @@ def main(argv: Sequence[str]) -> None:
         for cell in cells
         if not protocol.finished(arguments.out / name, cell)
     ]
-    if left:
+    if left and arguments.figures:
         print(f"{len(left)} cells are not finished, {left[0]} the first: no figures yet.")
     elif arguments.figures:
         from experiments import reproduced  # loads jax
