@@ -12,11 +12,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import filelock
+
 from experiments.cli import UsageError
 from maxent_jax import integrity, runs
 from maxent_jax.config import BASELINES, CLASSIC_ENVS, Config, check_choice, preset
 
-STUDY = "study.json"
+STUDY, LOCK = "study.json", "lock"
 VERSION = 1  # of a study's directory
 SCALES = ("toy", "cpu", "paper")
 ETAS = (0.1, 0.01, 0.001)
@@ -178,9 +180,8 @@ def claim(directory: Path, study: str, scale: str, cells: list[Cell]) -> None:
     """Makes the study's directory, or sees that it is this study's; more seeds may be added.
 
     Raises:
-      UsageError: it holds another study, or this one with other settings.
+      UsageError: it holds another study, or this one with other settings, or cannot be written.
     """
-    path = directory / STUDY
     content = runs.jsonable(
         {
             "version": VERSION,
@@ -189,6 +190,16 @@ def claim(directory: Path, study: str, scale: str, cells: list[Cell]) -> None:
             "cells": {cell.name: dataclasses.asdict(cell.config) for cell in cells},
         }
     )
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with filelock.FileLock(directory / LOCK):  # processes that share it may begin together
+            _claim(directory, content)
+    except OSError as error:
+        raise UsageError(f"cannot write to {directory}: {error.strerror}.") from None
+
+
+def _claim(directory: Path, content: Changes) -> None:
+    path = directory / STUDY
     if path.exists():
         try:
             held = json.loads(path.read_text())
@@ -198,7 +209,9 @@ def claim(directory: Path, study: str, scale: str, cells: list[Cell]) -> None:
         if differs:
             raise UsageError(f"{directory} holds another study: {differs}; choose another --out.")
         content["cells"] = held["cells"] | content["cells"]
-    elif directory.exists() and any(directory.iterdir()):
+        if content == held:
+            return
+    elif any(other.name != LOCK for other in directory.iterdir()):
         raise UsageError(f"{directory} is no study's, and not empty: choose another --out.")
     runs.write_json(path, content)
 

@@ -5,6 +5,7 @@ import dataclasses
 import json
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -110,6 +111,14 @@ def test_a_directory_belongs_to_one_study_and_may_gain_seeds(tmp_path):
         protocol.claim(directory, "fig4", "cpu", one)
     with pytest.raises(cli.UsageError, match="not empty"):
         protocol.claim(tmp_path, "fig4", "cpu", one)
+
+
+def test_processes_may_claim_a_directory_at_the_same_time(tmp_path):
+    parts = [protocol.make("fig4", "cpu", seeds) for seeds in (1, 2, 3, 4) * 4]
+    with ThreadPoolExecutor(16) as pool:
+        list(pool.map(lambda cells: protocol.claim(tmp_path / "s", "fig4", "cpu", cells), parts))
+    held = json.loads((tmp_path / "s" / protocol.STUDY).read_text())
+    assert set(held["cells"]) == {cell.name for cell in parts[3]}
 
 
 @pytest.fixture(scope="module")
