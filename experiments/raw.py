@@ -29,9 +29,12 @@ def read(directory: Path, cells: Sequence[Cell]) -> list[Row]:
     for cell in cells:
         for row in runs.read_metrics(directory / cell.name):
             for index in range(cell.config.num_seeds):
-                found.append(_of_seed(cell, row, index))
-                if cell.method == first and "random_coverage" in row:
-                    found.append(_of_random(cell, row, index))
+                seed = cell.config.seed + index
+                head: Row = {"env": cell.config.env, "method": cell.method, "seed": seed}
+                own = {k: v[index] if isinstance(v, list) else v for k, v in row.items()}
+                found.append(head | {name: own[name] for name in COLUMNS[3:] if name in own})
+                if cell.method == first and "random_coverage" in own:
+                    found.append(head | _of_random(own))
     return sorted(found, key=lambda row: (row["env"], row["method"] == RANDOM))
 
 
@@ -58,21 +61,8 @@ def groups(rows: Sequence[Row]) -> Iterator[tuple[str, str, dict[str, np.ndarray
         )
 
 
-def _of_seed(cell: Cell, row: Row, index: int) -> Row:
-    def value(name: str) -> Any:
-        return row[name][index] if isinstance(row[name], list) else row[name]
-
-    found = {name: value(name) for name in COLUMNS[3:] if name in row}
-    return _head(cell, index) | found
-
-
-def _of_random(cell: Cell, row: Row, index: int) -> Row:
-    whole = _of_seed(cell, row, index)
-    kept = {name: whole[name] for name in ("iteration", "env_steps", "wall_seconds")}
-    renamed = {f"cumulative_{name}": row[f"random_{name}"] for name in MEASURED}
-    picked = {k: v[index] if isinstance(v, list) else v for k, v in renamed.items()}
-    return _head(cell, index) | {"method": RANDOM, "gradient_steps": 0} | kept | picked
-
-
-def _head(cell: Cell, index: int) -> Row:
-    return {"env": cell.config.env, "method": cell.method, "seed": cell.config.seed + index}
+def _of_random(row: Row) -> Row:
+    """What the random policy beside a run reached."""
+    kept = {name: row[name] for name in ("iteration", "env_steps", "wall_seconds")}
+    reached = {f"cumulative_{name}": row[f"random_{name}"] for name in MEASURED}
+    return {"method": RANDOM, "gradient_steps": 0} | kept | reached

@@ -84,8 +84,7 @@ def main(argv: Sequence[str]) -> None:
 
 def _check(arguments: Arguments) -> tuple[int, int]:
     """The shard."""
-    if arguments.what not in (*FIGURES, "all", *protocol.STUDIES):
-        check_choice("study", arguments.what, ("all", *FIGURES, *protocol.STUDIES))
+    check_choice("study", arguments.what, ("all", *FIGURES, *protocol.STUDIES))
     check_choice("scale", arguments.scale, protocol.SCALES)
     if arguments.seeds is not None and arguments.seeds < 1:
         raise cli.UsageError(f"seeds is {arguments.seeds}, but a study needs at least 1.")

@@ -96,7 +96,7 @@ def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[
     ours = "V" if "V" in names else names[0]
     return {
         "compared_with": ours,
-        "seeds": len(next(iter(groups))[2]["env_steps"]),
+        "seeds": len(groups[0][2]["env_steps"]),
         "last_iteration": {
             name: statistics.compare(
                 {method: list(of_env.values()) for method, of_env in by_method.items()}, ours

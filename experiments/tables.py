@@ -58,8 +58,7 @@ def last(run: Run, name: str) -> Any:
 def headline(seeds: Sequence[Run]) -> dict[str, Any]:
     """A sentence about a run, and its figures: means over the seeds."""
     first = seeds[0]
-    bins = first.parts.grid.bins
-    cells = f"of {bins[0] * bins[1]:,}"
+    cells = f"of {first.parts.grid.num_cells:,}"
     trained = f"{first.num_policies - 1} of {first.config.num_iterations} policies trained"
     kind = "1 seed" if len(seeds) == 1 else f"{len(seeds)} seeds, of which these are the means"
     tiles = (

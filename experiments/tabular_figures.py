@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from maxent_jax import runs
+from maxent_jax import plotting
 
 METHODS = {  # colour and line
     "V": ("#d1495b", "-"),
@@ -31,12 +31,7 @@ def draw(results: Mapping[str, Any], directory: Path) -> list[Path]:
         "theory_refresh": refresh(results),
         "theory_cases": cases(results),
     }
-    paths = []
-    for name, figure in figures.items():
-        paths.append(directory / f"{name}.png")
-        with runs.whole_file(paths[-1]) as temporary:
-            figure.savefig(temporary, dpi=110, bbox_inches="tight")
-    return paths
+    return [plotting.save(figure, directory, name) for name, figure in figures.items()]
 
 
 def gaps(results: Mapping[str, Any]) -> Figure:

@@ -366,13 +366,8 @@ _AS_PUBLISHED: dict[str, Any] = dict(
 # normal states of 29 dimensions, where rnd, icm, re3, vcse and apt pay 0.6 to 1.2 as they are.
 _SIZES = {"kmeans": 50.0, "ngu": 0.03, "renyi": 0.03, "rise": 0.25}
 _OF_METHOD: dict[str, dict[str, Any]] = {
-    "h-official": dict(
-        bonus="histogram",
-        mixing="step",
-        deterministic=True,
-        leave_own_out=False,
-        **_AS_PUBLISHED,
-    ),
+    "h-official": _AS_PUBLISHED
+    | dict(bonus="histogram", mixing="step", deterministic=True, leave_own_out=False),
     **{
         name: _AS_PUBLISHED | dict(bonus=name, reward_scale=_SIZES.get(name, 1.0))
         for name in BASELINES

@@ -34,8 +34,7 @@ AGENT, MIXTURE, RANDOM = "#1b6ca8", "#d1495b", "#7a7a7a"
 def curves(run: Run) -> Figure:
     """Coverage and entropy against iterations, env steps and wall-clock."""
     figure = Figure(figsize=(11, 6.4), layout="constrained")
-    bins = run.parts.grid.bins
-    axes = _axes_of_curves(figure, f"visited cells of {bins[0] * bins[1]:,}")
+    axes = _axes_of_curves(figure, f"visited cells of {run.parts.grid.num_cells:,}")
     for prefix, name, color, style in (
         ("cumulative", "training, all states so far", AGENT, "-o"),
         ("mixture", "rollouts of the mixture", MIXTURE, "-s"),

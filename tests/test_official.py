@@ -169,7 +169,7 @@ def test_cells_are_those_of_the_official_code(name):
     observations = np.array([see(name, state) for state in states])
     expected = [cell_by_hand(name, x) for x in observations]
     grid = envs.entry(name).grid
-    both = jax.jit(lambda x: (reinforce.cell(grid, x), histogram.count(x, grid)))
+    both = jax.jit(lambda x: (histogram.cells(x, grid), histogram.count(x, grid)))
     found, counts = both(jnp.asarray(observations, jnp.float32))
     np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(counts.ravel(), np.bincount(expected, minlength=counts.size))

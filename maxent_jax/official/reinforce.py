@@ -15,7 +15,6 @@ from brax.envs.base import State
 
 from maxent_jax import envs
 from maxent_jax.density import histogram
-from maxent_jax.density.histogram import Grid
 from maxent_jax.official.settings import Settings
 
 NUM_ACTIONS = 3  # backwards, none, forwards
@@ -99,18 +98,6 @@ def rollout(
     return jax.lax.scan(step, (start, observed), uniform)[1]
 
 
-def cell(grid: Grid, observation: jax.Array) -> jax.Array:
-    """[...] int32: which cell, counted row by row, an observation [..., D] lies in."""
-    position = histogram.locate(observation, grid)
-    low, high, bins = (np.array(x) for x in (grid.low, grid.high, grid.bins))
-    along = [
-        jnp.clip((position[..., i] - low[i]) / (high[i] - low[i]) * bins[i], 0, bins[i] - 1)
-        for i in (0, 1)
-    ]
-    row, column = (x.astype(jnp.int32) for x in along)
-    return row * grid.bins[1] + column
-
-
 def normalised_returns(rewards: jax.Array, discount: float) -> jax.Array:
     """[T] discounted sums of rewards [T] from each step on, of mean 0 and sample deviation 1."""
     add = lambda later, reward: (reward + discount * later,) * 2
@@ -153,7 +140,7 @@ def train(
         uniform = jax.random.uniform(key_episode, (settings.train_steps + 1, 3))
         begin = jnp.where(i % 2 == 0, start, plain_reset(settings, uniform[0, 1:]))
         path = rollout(settings, probabilities_of(policy), begin, uniform[1:])
-        returns = normalised_returns(reward[cell(grid, path.reached)], settings.discount)
+        returns = normalised_returns(reward[histogram.cells(path.reached, grid)], settings.discount)
         change, moments = optimizer.update(jax.grad(loss)(policy, path, returns), moments)
         visits = visits + histogram.count(path.reached, grid)
         return optax.apply_updates(policy, change), moments, visits

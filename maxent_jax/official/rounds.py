@@ -93,14 +93,14 @@ def pooled_entropy(visits: jax.Array) -> jax.Array:
 
 def play_all(settings: Settings, weights: jax.Array, key: jax.Array) -> Metrics:
     """A run of P rounds, mixed by `weights` [P, P]: fields of Trace, [P, ...]."""
-    bins = envs.entry(settings.env).grid.bins
+    grid = envs.entry(settings.env).grid
     policy = jax.eval_shape(lambda: reinforce.init_policy(settings, key))
     state = State(
         policies=jax.tree.map(lambda x: jnp.zeros((settings.num_rounds, *x.shape)), policy),
-        reward=jnp.zeros(bins[0] * bins[1]),
+        reward=jnp.zeros(grid.num_cells),
         start=_rest(settings),
         has_start=jnp.array(True),
-        visits=jnp.zeros(bins, jnp.int32),
+        visits=jnp.zeros(grid.bins, jnp.int32),
         rollout_steps=jnp.zeros((), jnp.int32),
     )
     keys = jax.random.split(key, (settings.num_rounds, 6))
