@@ -71,14 +71,16 @@ CLASSIC = {
     "paper": Scale("paper", 10, CLASSIC_ENVS),
 }
 THREE: dict[str, Changes] = {name.upper(): {"method": name} for name in ("h", "la", "v")}
+# Ablations of what an iteration does, not of what the iterations add up to, end after two of them.
+ABLATION = ROBOT | {"cpu": Scale("quick", 3, ("ant",), {"num_iterations": 2})}
 UNSHAPED: Changes = {"shaping": 0.0, "shaping_survives_death": False}
+# A method's own choice is left to the method: see `home`.
 REFRESHED: dict[str, Changes] = {
-    f"every {period or 'iteration'}": {
-        "reference": "history",
-        "refresh_period": period,
-        "start": "last",
-    }
-    for period in (1, 10, 100, 0)
+    "every 1": {"method": "la"},
+    **{
+        f"every {period or 'iteration'}": {"method": "la", "refresh_period": period}
+        for period in (10, 100, 0)
+    },
 }
 
 STUDIES: dict[str, Study] = {
@@ -90,7 +92,7 @@ STUDIES: dict[str, Study] = {
     "weights": Study(
         "weights of the mixture; all else is V's",
         {
-            "uniform": {"weights": "uniform"},
+            "uniform": {},
             **{f"η = {eta}": {"weights": "geometric", "eta": eta} for eta in ETAS},
             "fully corrective": {"weights": "fully_corrective"},
         },
@@ -102,23 +104,23 @@ STUDIES: dict[str, Study] = {
     ),
     "start": Study(
         "the agent that V's iterations start from",
-        {start: {"start": start} for start in ("scratch", "last", "best")},
+        {"best": {}, "last": {"start": "last"}, "scratch": {"start": "scratch"}},
         ROBOT,
     ),
     "episodic": Study(
         "weight of the episodic term",
         {f"λ = {weight}": {"episodic_weight": weight} for weight in (0.0, 0.01, 0.1, 1.0)},
-        ROBOT,
+        ABLATION,
     ),
     "form": Study(
         "form of the reward",
         {form: {"reward": form} for form in ("log1p", "linear", "log", "paper")},
-        ROBOT,
+        ABLATION,
     ),
     "stale": Study(
         "stored rewards, of the current reference or of their time",
         {"recomputed": {}, "stale": {"stale_rewards": True}},
-        ROBOT,
+        ABLATION,
     ),
     "termination": Study(
         "what ends an episode",
@@ -127,7 +129,7 @@ STUDIES: dict[str, Study] = {
             "health": {"end_flipped": False},
             "nothing": {"end_flipped": False, "end_unhealthy": False},
         },
-        ROBOT | {"toy": TOY._replace(envs=("ant",))},
+        ABLATION | {"toy": TOY._replace(envs=("ant",))},
     ),
     "published": Study(
         "H and LA as published, and as the paper reads them, none of them shaped",
@@ -136,7 +138,7 @@ STUDIES: dict[str, Study] = {
             "H, official": {"method": "h-official"},
             "APT": {"method": "apt"},
         },
-        ROBOT,
+        ABLATION,
     ),
     "baselines": Study(
         "rewards that the field compares with, one policy each, and V",
@@ -228,7 +230,29 @@ def _difference(held: Changes, asked: Changes) -> str:
     return ""
 
 
+def home(directory: Path, cell: Cell) -> Path:
+    """The directory of the cell's run: its own, or, where it has none yet, that of an equal run of
+    this study or one beside it, under whatever name.
+    """
+    own = directory / cell.name
+    if not own.exists():
+        config = runs.jsonable(dataclasses.asdict(cell.config))
+        for study in sorted(directory.parent.glob(f"*/{STUDY}")):
+            for name, held in _cells(study).items():
+                if held == config and (study.parent / name).exists():
+                    return study.parent / name
+    return own
+
+
+def _cells(study: Path) -> dict[str, Changes]:
+    try:
+        held = json.loads(study.read_text())
+        return dict(held["cells"]) if held["version"] == VERSION else {}
+    except (ValueError, KeyError, TypeError):
+        return {}
+
+
 def finished(directory: Path, cell: Cell) -> bool:
     """Whether the cell's run is complete and saved."""
-    names = integrity.checkpoints(directory / cell.name)
+    names = integrity.checkpoints(home(directory, cell))
     return names[-1:] == [f"{cell.config.num_iterations}"]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments import protocol
 from experiments.protocol import Cell
 from maxent_jax import runs
 
@@ -27,7 +28,7 @@ def read(directory: Path, cells: Sequence[Cell]) -> list[Row]:
     found = []
     first = cells[0].method
     for cell in cells:
-        for row in runs.read_metrics(directory / cell.name):
+        for row in runs.read_metrics(protocol.home(directory, cell)):
             for index in range(cell.config.num_seeds):
                 seed = cell.config.seed + index
                 head: Row = {"env": cell.config.env, "method": cell.method, "seed": seed}

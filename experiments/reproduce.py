@@ -110,7 +110,7 @@ def _train(directory: Path, cells: Sequence[Cell]) -> None:
         if protocol.finished(directory, cell):
             continue
         started = time.perf_counter()
-        arguments = train.Arguments(cell.config, out=directory / cell.name, resume=True)
+        arguments = train.Arguments(cell.config, out=protocol.home(directory, cell), resume=True)
         try:
             with train.claimed(arguments):
                 from experiments import driver  # loads jax

@@ -79,7 +79,7 @@ def fig5(directory: Path, trained: Path, cells: Sequence[Cell]) -> None:
     """Where the first seed of each method went: in training, by the mixture, and each policy."""
     for env in dict.fromkeys(cell.config.env for cell in cells):
         chosen = [c for c in cells if c.config.env == env and c.config.seed == 0]
-        figure = paper_figures.occupancies({c.method: trained / c.name for c in chosen})
+        figure = paper_figures.occupancies({c.method: protocol.home(trained, c) for c in chosen})
         _save(figure, directory, f"fig5_{env}")
 
 

@@ -153,6 +153,31 @@ def test_a_stopped_study_repeats_no_finished_cell(finished):
     assert trained == [cell.name for cell in protocol.make("fig4", "toy", 1)]
 
 
+def test_a_run_that_another_study_has_is_not_trained_again(finished, monkeypatch):
+    out, _ = finished
+    trained = []
+    monkeypatch.setattr(driver, "train", lambda config, directory, *_: trained.append(directory))
+    for study in ("start", "weights", "refresh"):
+        reproduce.main([study, *TOY, "--out", str(out), "--no-figures"])
+    names = {directory.relative_to(out).as_posix() for directory in trained}
+    cells = {
+        f"{study}/{cell.name}"
+        for study in ("start", "weights", "refresh")
+        for cell in protocol.make(study, "toy", 1)
+    }
+    theirs = {"start/pendulum-best-0", "weights/pendulum-uniform-0", "refresh/pendulum-every_1-0"}
+    assert theirs < cells and names == cells - theirs
+
+    uniform = protocol.make("weights", "toy", 1)[0]
+    assert protocol.home(out / "weights", uniform) == out / "fig4" / "pendulum-V-0"
+    assert raw.read(out / "weights", [uniform])[0]["method"] == "uniform"
+    (out / "broken").mkdir()
+    (out / "broken" / protocol.STUDY).write_text("{")
+    assert protocol.home(out / "weights", uniform) == out / "fig4" / "pendulum-V-0"
+    (out / "weights" / uniform.name).mkdir()
+    assert protocol.home(out / "weights", uniform) == out / "weights" / uniform.name
+
+
 def test_the_raw_values_are_those_of_the_runs(finished):
     out, _ = finished
     with open(out / "fig4" / "raw.csv") as file:
