@@ -16,7 +16,9 @@ from typing import Any
 
 from benchmarks import common
 from maxent_jax import runs
-from maxent_jax.config import ENVS, PRESETS, preset
+from maxent_jax.choices import ENVS
+from maxent_jax.config import preset
+from maxent_jax.presets import PRESETS
 
 TRAIN = ("-m", "experiments.train", "--num-iterations", "1")
 

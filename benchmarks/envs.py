@@ -21,7 +21,8 @@ from mujoco import rollout
 
 from benchmarks import common
 from maxent_jax import envs, runtime
-from maxent_jax.config import PHYSICS, Config
+from maxent_jax.choices import PHYSICS
+from maxent_jax.config import Config
 from maxent_jax.envs import base, physics
 from maxent_jax.envs.task import MujocoEnv
 

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 
 from benchmarks import common
 from maxent_jax import experience, parts
-from maxent_jax.config import MUJOCO_ENVS, Config, preset
+from maxent_jax.choices import MUJOCO_ENVS
+from maxent_jax.config import Config, preset
 from maxent_jax.experience import Reference
 from maxent_jax.sac import replay
 from maxent_jax.sac.replay import Replay

@@ -9,7 +9,9 @@ from typing import Any
 
 from benchmarks import common
 from maxent_jax import algorithm, runtime
-from maxent_jax.config import BACKENDS, ENVS, PRESETS, preset
+from maxent_jax.choices import BACKENDS, ENVS
+from maxent_jax.config import preset
+from maxent_jax.presets import PRESETS
 
 
 def seconds_per_segment(config, repeats: int) -> float:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import tyro
 
 from experiments.interruption import Interrupted
-from maxent_jax.config import ConfigError
+from maxent_jax.choices import ConfigError
 from maxent_jax.runs import NonFiniteError, RunError, SaveError
 
 Arguments = TypeVar("Arguments")

@@ -16,7 +16,8 @@ import filelock
 
 from experiments.cli import UsageError
 from maxent_jax import integrity, runs
-from maxent_jax.config import BASELINES, CLASSIC_ENVS, Config, check_choice, preset
+from maxent_jax.choices import BASELINES, CLASSIC_ENVS
+from maxent_jax.config import Config, preset
 
 STUDY, LOCK = "study.json", "lock"
 VERSION = 1  # of a study's directory
@@ -151,18 +152,10 @@ STUDIES: dict[str, Study] = {
 
 
 def make(study: str, scale: str, num_seeds: int | None = None) -> list[Cell]:
-    """The cells of a study, all methods of a seed before the next seed.
-
-    Raises:
-      ConfigError, UsageError: an unknown study or scale, or no seeds.
-    """
-    check_choice("study", study, STUDIES)
-    check_choice("scale", scale, SCALES)
+    """The cells of a study at a scale, all methods of a seed before the next seed."""
     chosen = STUDIES[study]
     at = chosen.scales[scale]
     seeds = at.num_seeds if num_seeds is None else num_seeds
-    if seeds < 1:
-        raise UsageError(f"seeds is {seeds}, but a study needs at least 1.")
     width = seeds if chosen.together else 1
     return [
         Cell(

@@ -18,7 +18,7 @@ import tyro
 
 from experiments import cli, protocol, train
 from experiments.protocol import Cell
-from maxent_jax.config import check_choice
+from maxent_jax.choices import check_choice
 
 # What a figure of the paper is made of: studies, by name. Fig. 3's other half, weights on Ant, is
 # the study `weights`: on a CPU it takes longer than all the rest.

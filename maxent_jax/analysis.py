@@ -23,7 +23,8 @@ from maxent_jax import (
     parts,
     runs,
 )
-from maxent_jax.config import CORRECTIVE, Config
+from maxent_jax.choices import CORRECTIVE
+from maxent_jax.config import Config
 from maxent_jax.density import histogram
 from maxent_jax.mixture import Archive
 from maxent_jax.occupancy import Occupancy, Scores

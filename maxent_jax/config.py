@@ -1,38 +1,10 @@
-"""Every setting of a run, its presets, and the checks of its values. Loads no array library."""
+"""Every setting of a run, and the checks of their values. Loads no array library."""
 
 import dataclasses
-import difflib
-from collections.abc import Collection
 from typing import Any
 
-MUJOCO_ENVS = ("ant", "walker2d", "humanoid")
-CLASSIC_ENVS = ("pendulum", "mountain_car")
-ENVS = MUJOCO_ENVS + CLASSIC_ENVS
-BRAX_ENVS = (
-    *("ant", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum"),
-    *("inverted_double_pendulum", "pusher", "reacher", "swimmer", "walker2d"),
-)
-TORSO_ENVS = ("ant", "humanoid")  # a floating torso has a heading, and can be upside down
-TURNING_ENVS = ("ant",)  # whose observation we know how to turn about the vertical
-BONUSES = ("rnd", "icm", "ngu", "re3", "rise", "renyi", "vcse", "kmeans", "apt", "histogram")
-BASELINES = BONUSES[:-1]  # methods that one policy learns, paid by the bonus of that name
-METHODS = ("h", "la", "v", "h-official", *BASELINES)
-BACKENDS = ("auto", "mjx", "mujoco", "warp")
-PHYSICS = ("reference", "fast")
-REWARDS = ("log1p", "linear", "log", "paper")
-INPUTS = ("state", "heading")
-SPACES = ("features", "position")
-REPLAY_DTYPES = ("float32", "float16")
-CORRECTIVE = "fully_corrective"
-WEIGHTS = ("method", "uniform", "geometric", "last", CORRECTIVE)
-MIXINGS = ("episode", "step")
-REFERENCES = ("method", "mixture", "history")
-STARTS = ("method", "scratch", "last", "best")
-BY_METHOD = -1
-
-
-class ConfigError(ValueError):
-    """A setting that no run can have; the message says which, and what to do."""
+from maxent_jax import choices, presets
+from maxent_jax.choices import BY_METHOD, CLASSIC_ENVS, CORRECTIVE, MUJOCO_ENVS, ConfigError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,7 +178,7 @@ class Config:
 
     def deviations(self) -> dict[str, str]:
         """What this config does otherwise than the paper, by field."""
-        paper = _PAPER | {"episode_length": _time_limit(self.env)}
+        paper = presets.PAPER | {"episode_length": _time_limit(self.env)}
         named = {name: why for name, (value, why) in paper.items() if getattr(self, name) != value}
         if self.shaping > 0 and self.shaping_space == "position":
             named["shaping_space"] = "the potential is measured in position alone"
@@ -227,153 +199,6 @@ DATA_FIELDS = (
 )
 _DEFAULTS = {field.name: field.default for field in dataclasses.fields(Config)}
 
-# What the paper does, and how a run that does otherwise says so.
-_PAPER: dict[str, tuple[Any, str]] = {
-    "physics": ("reference", "the physics is simplified"),
-    "torque_limit": (1.0, "torques are limited to a share of the control range"),
-    "end_flipped": (False, "an episode also ends upside down"),
-    "end_unhealthy": (True, "an episode goes on where health fails"),
-    "policy_inputs": ("state", "networks see the state in the heading's frame"),
-    "yaw_copies": (0, "episodes turned by a random yaw are learned from too"),
-    "reward": ("paper", "the reward's form is not p log R"),
-    "reward_scale": (1.0, "the reward is scaled"),
-    "stale_rewards": (False, "rewards are not those of the current reference"),
-    "shaping": (0.0, "the reward is shaped by a potential"),
-    "shaping_survives_death": (False, "the potential survives death: not policy-invariant"),
-    "pooled": (False, "the reference is drawn from the pooled states of the mixture"),
-    "bonus": ("none", "SAC is not paid by the distance to the reference"),
-    "mixing": ("episode", "a policy of the mixture is drawn for each step"),
-    "deterministic": (False, "policies are evaluated by their mean actions"),
-    "eta": (0.1, "η is not 0.1"),
-    "num_neighbors": (3, "k is not 3"),
-    "leave_own_out": (False, "policies are scored without their own states"),
-    "hidden_layers": (2, "networks do not have 2 hidden layers"),
-    "hidden_size": (256, "hidden layers are not 256 wide"),
-    "critic_layer_norm": (False, "critics have layer norm"),
-    "learning_rate": (3e-4, "Adam's rate is not 3e-4"),
-    "batch_size": (128, "the batch is not 128"),
-    "replay_size": (1_000_000, "the replay does not hold 1e6 transitions"),
-    "replay_dtype": ("float32", "states in the replay are rounded to 16 bits"),
-    "discount": (0.99, "γ is not 0.99"),
-    "return_steps": (1, "critics learn from returns of several steps"),
-    "soft_update_rate": (0.005, "the soft update is not 0.005"),
-    "initial_temperature": (0.2, "the temperature starts elsewhere than at 0.2"),
-    "target_entropy_scale": (1.0, "the target entropy is not minus the number of actions"),
-    "restart_temperature": (False, "the temperature restarts in each iteration"),
-}
-
-_FAST_LEARNER: dict[str, Any] = dict(
-    critic_layer_norm=True,
-    learning_rate=1e-3,
-    return_steps=3,
-    initial_temperature=0.1,
-    restart_temperature=True,
-)
-
-PRESETS: dict[str, dict[str, Any]] = {
-    "smoke": dict(
-        num_iterations=2,
-        steps_per_iteration=400,
-        updates_per_step=0.25,
-        num_envs=4,
-        num_segments=2,
-        episode_length=100,
-        num_starts=64,
-        reference_size=256,
-        mixture_episodes=8,
-        hidden_size=32,
-        batch_size=32,
-        replay_size=2_000,
-    ),
-    "quick": dict(
-        num_envs=64,
-        steps_per_iteration=120_000,
-        updates_per_step=0.25,
-        hidden_size=128,
-        **_FAST_LEARNER,
-        replay_size=240_000,
-    ),
-    "gpu": dict(
-        num_iterations=20,
-        num_envs=2048,
-        steps_per_iteration=2_048_000,
-        num_segments=20,
-        updates_per_step=1 / 64,
-        batch_size=4096,
-        **_FAST_LEARNER,
-        reference_size=131_072,
-        mixture_episodes=256,
-    ),
-    "paper": dict(
-        num_iterations=20,
-        steps_per_iteration=150_000,
-        updates_per_step=1.0,
-        num_envs=16,
-        num_segments=25,
-        reward="paper",
-        episodic_weight=0.1,
-        leave_own_out=False,
-        reference_size=16_384,
-        mixture_episodes=64,
-    ),
-}
-
-_LOCOMOTION = dict(
-    shaping=100.0,
-    shaping_space="position",
-    shaping_survives_death=True,
-    reward_distance=20.0,
-    reward_scale=8.0,
-)
-_CLASSIC = dict(episode_length=200)
-_ROBOTS: dict[str, dict[str, Any]] = {
-    "ant": dict(
-        torque_limit=0.4,
-        end_flipped=True,
-        policy_inputs="heading",
-        yaw_copies=1,
-        **_LOCOMOTION,
-    ),
-    "walker2d": _LOCOMOTION,
-    "humanoid": dict(policy_inputs="heading", **_LOCOMOTION),
-}
-
-# What a preset does otherwise in some environment.
-_IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
-    **{("quick", env): changes for env, changes in _ROBOTS.items()},
-    **{("gpu", env): dict(physics="fast", **changes) for env, changes in _ROBOTS.items()},
-    **{
-        ("gpu", env): dict(reference_size=32_768, reward_distance=0.1, **_CLASSIC)
-        for env in CLASSIC_ENVS
-    },
-    **{("paper", env): dict(reference_size=8_192, **_CLASSIC) for env in CLASSIC_ENVS},
-    **{
-        ("quick", env): dict(
-            steps_per_iteration=19_200,
-            reference_size=4_096,
-            reward_distance=0.1,
-            **_CLASSIC,
-        )
-        for env in CLASSIC_ENVS
-    },
-}
-
-# What methods as their authors published them, and the baselines, do whatever the preset.
-_AS_PUBLISHED: dict[str, Any] = dict(
-    shaping=0.0, shaping_survives_death=False, episodic_weight=0.0, return_steps=1, reward_scale=1.0
-)
-# Factors that bring a bonus to a size of about 1, which the temperature is made for: measured on
-# normal states of 29 dimensions, where rnd, icm, re3, vcse and apt pay 0.6 to 1.2 as they are.
-_SIZES = {"kmeans": 50.0, "ngu": 0.03, "renyi": 0.03, "rise": 0.25}
-_OF_METHOD: dict[str, dict[str, Any]] = {
-    "h-official": _AS_PUBLISHED
-    | dict(bonus="histogram", mixing="step", deterministic=True, leave_own_out=False),
-    **{
-        name: _AS_PUBLISHED | dict(bonus=name, reward_scale=_SIZES.get(name, 1.0))
-        for name in BASELINES
-    },
-}
-
 
 def preset(name: str, **changes: Any) -> Config:
     """The config of that preset, in its environment and for its method, with changes.
@@ -381,30 +206,10 @@ def preset(name: str, **changes: Any) -> Config:
     Raises:
       ConfigError: an unknown preset, or a value that no run can have.
     """
-    check_choice("preset", name, PRESETS)
-    in_env = _IN_ENV.get((name, changes.get("env", Config.env)), {})
-    of_method = _OF_METHOD.get(changes.get("method", Config.method), {})
-    return Config(**{"preset": name, **PRESETS[name], **in_env, **of_method, **changes})
-
-
-def check_env(name: str) -> None:
-    """Raises ConfigError unless an environment can have that name."""
-    names = (*ENVS, *(f"brax:{env}" for env in BRAX_ENVS))
-    if not name.startswith("user:"):
-        check_choice("env", name, names)
-
-
-def check_physics(env: str, backend: str, physics: str) -> None:
-    """Raises ConfigError where the environment has no such backend or physics."""
-    check_choice("backend", backend, BACKENDS)
-    check_choice("physics", physics, PHYSICS)
-    if env in MUJOCO_ENVS or env.startswith("user:"):
-        return
-    backends = ("auto",) if env in CLASSIC_ENVS else ("auto", "mjx")
-    if backend not in backends:
-        raise ConfigError(f"backend is {backend}, but {env} has only: {', '.join(backends)}.")
-    if physics != "reference":
-        raise ConfigError(f"physics is {physics}, but {env} has only: reference.")
+    choices.check_choice("preset", name, presets.PRESETS)
+    in_env = presets.IN_ENV.get((name, changes.get("env", Config.env)), {})
+    of_method = presets.OF_METHOD.get(changes.get("method", Config.method), {})
+    return Config(**{"preset": name, **presets.PRESETS[name], **in_env, **of_method, **changes})
 
 
 def _time_limit(env: str) -> tuple[int, str]:
@@ -412,27 +217,18 @@ def _time_limit(env: str) -> tuple[int, str]:
     return steps, f"the time limit is not {steps} steps"
 
 
-def check_choice(what: str, value: str, known: Collection[str]) -> None:
-    """Raises ConfigError unless the value is among the known ones; it names the nearest."""
-    if value in known:
-        return
-    nearest = difflib.get_close_matches(value, known, n=1, cutoff=0.4)
-    hint = f"did you mean '{nearest[0]}'?" if nearest else f"choose one of {', '.join(known)}."
-    raise ConfigError(f"unknown {what} '{value}': {hint}")
-
-
 _CHOICES = {
-    "method": METHODS,
-    "bonus": ("none", *BONUSES),
-    "mixing": MIXINGS,
-    "preset": PRESETS,
-    "reward": REWARDS,
-    "policy_inputs": INPUTS,
-    "shaping_space": SPACES,
-    "replay_dtype": REPLAY_DTYPES,
-    "weights": WEIGHTS,
-    "reference": REFERENCES,
-    "start": STARTS,
+    "method": choices.METHODS,
+    "bonus": ("none", *choices.BONUSES),
+    "mixing": choices.MIXINGS,
+    "preset": presets.PRESETS,
+    "reward": choices.REWARDS,
+    "policy_inputs": choices.INPUTS,
+    "shaping_space": choices.SPACES,
+    "replay_dtype": choices.REPLAY_DTYPES,
+    "weights": choices.WEIGHTS,
+    "reference": choices.REFERENCES,
+    "start": choices.STARTS,
 }
 _AT_LEAST_ONE = (
     *("num_seeds", "num_iterations", "steps_per_iteration", "num_envs", "num_segments"),
@@ -451,10 +247,10 @@ _NOT_NEGATIVE = (
 
 
 def _check(config: Config) -> None:
-    check_env(config.env)
-    check_physics(config.env, config.backend, config.physics)
+    choices.check_env(config.env)
+    choices.check_physics(config.env, config.backend, config.physics)
     for name, known in _CHOICES.items():
-        check_choice(name.replace("_", "-"), getattr(config, name), known)
+        choices.check_choice(name.replace("_", "-"), getattr(config, name), known)
     bounds = (
         (_AT_LEAST_ONE, lambda x: x >= 1, "at least 1"),
         (_POSITIVE, lambda x: 0 < x < float("inf"), "a positive number"),
@@ -475,7 +271,7 @@ def _check_together(c: Config) -> None:
     updates = c.updates_per_step * c.num_envs
     for wrong, sentence in (
         (
-            c.bonus != _OF_METHOD.get(c.method, {}).get("bonus", c.bonus),
+            c.bonus != presets.OF_METHOD.get(c.method, {}).get("bonus", c.bonus),
             f"method is {c.method}, but bonus is {c.bonus}: leave it to the method.",
         ),
         (
@@ -497,7 +293,7 @@ def _check_together(c: Config) -> None:
             f"torque-limit is {c.torque_limit}, but {c.env} has no torques to limit.",
         ),
         (
-            c.end_flipped and c.env not in TORSO_ENVS,
+            c.end_flipped and c.env not in choices.TORSO_ENVS,
             f"end-flipped is on, but {c.env} has no floating torso that could be upside down.",
         ),
         (
@@ -505,11 +301,11 @@ def _check_together(c: Config) -> None:
             f"end-unhealthy is off, but {c.env} has no health that could fail.",
         ),
         (
-            c.policy_inputs == "heading" and c.env not in TORSO_ENVS,
+            c.policy_inputs == "heading" and c.env not in choices.TORSO_ENVS,
             f"policy-inputs is heading, but {c.env} has no floating torso with a heading.",
         ),
         (
-            c.yaw_copies and c.env not in TURNING_ENVS,
+            c.yaw_copies and c.env not in choices.TURNING_ENVS,
             f"yaw-copies is {c.yaw_copies}, but {c.env} cannot be turned about the vertical.",
         ),
         (

@@ -15,7 +15,8 @@ from jax.sharding import PartitionSpec as P
 
 from maxent_jax import algorithm
 from maxent_jax.algorithm import Programs, State
-from maxent_jax.config import Config, ConfigError
+from maxent_jax.choices import ConfigError
+from maxent_jax.config import Config
 
 SEEDS, ENVS = "seeds", "envs"  # the mesh's axes
 

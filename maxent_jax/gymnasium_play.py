@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 
 from maxent_jax import analysis, parts
 from maxent_jax.analysis import Paths, Run
-from maxent_jax.config import Config, ConfigError
+from maxent_jax.choices import ConfigError
+from maxent_jax.config import Config
 
 IDS = {"ant": "Ant-v4", "walker2d": "Walker2d-v4", "humanoid": "Humanoid-v4"}
 NUM_SETS = 5  # sets of our own episodes, whose differences are chance alone

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 
-from maxent_jax.config import MUJOCO_ENVS
+from maxent_jax.choices import MUJOCO_ENVS
 from maxent_jax.runs import RunError
 
 VARIABLE = "MUJOCO_GL"

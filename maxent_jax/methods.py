@@ -1,7 +1,7 @@
 """MaxEnt-H, LA and V: rows of data. The algorithm reads the arrays and knows no method.
 
 The rows are what differs between programs' data; what a method as its authors published it does
-otherwise is in config.preset.
+otherwise is in presets.
 """
 
 from typing import NamedTuple
@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from maxent_jax import mixture
-from maxent_jax.config import BASELINES, BY_METHOD, Config
+from maxent_jax.choices import BASELINES, BY_METHOD
+from maxent_jax.config import Config
 
 
 class Row(NamedTuple):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from maxent_jax import mixture, rewards, rollout
-from maxent_jax.config import CORRECTIVE
+from maxent_jax.choices import CORRECTIVE
 from maxent_jax.density import entropy, histogram
 from maxent_jax.density.knn import NONE_EXCLUDED, knn_distances
 from maxent_jax.envs.base import State

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 
 from maxent_jax import bonuses, envs
 from maxent_jax.bonuses import Bonus
-from maxent_jax.config import CLASSIC_ENVS, MUJOCO_ENVS, Config
+from maxent_jax.choices import CLASSIC_ENVS, MUJOCO_ENVS
+from maxent_jax.config import Config
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs.base import Env
 from maxent_jax.envs.task import observation_size

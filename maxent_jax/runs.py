@@ -12,7 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from maxent_jax.config import Config, ConfigError
+from maxent_jax.choices import ConfigError
+from maxent_jax.config import Config
 
 SCHEMA = 4  # of the directory, checkpoints included
 CONFIG, METRICS, FIGURES = "config.json", "metrics.jsonl", "figures"

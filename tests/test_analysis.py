@@ -16,7 +16,8 @@ import maxent_jax
 from experiments import evaluate
 from maxent_jax import analysis, features, runs
 from maxent_jax.analysis import Paths
-from maxent_jax.config import ConfigError, preset
+from maxent_jax.choices import ConfigError
+from maxent_jax.config import preset
 
 ROOT = Path(__file__).parent.parent
 NOTEBOOK = ROOT / "docs" / "analysis.ipynb"

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from maxent_jax import algorithm, parts, training
-from maxent_jax.config import BASELINES, preset
+from maxent_jax.choices import BASELINES
+from maxent_jax.config import preset
 
 STEPS = 12
 STILL = ("re3", "rise", "renyi", "vcse")  # have nothing to learn
@@ -110,7 +111,7 @@ def test_health_ends_an_episode_only_where_it_should(ends):
 
 
 def test_what_a_bonus_cannot_have_is_said():
-    from maxent_jax.config import ConfigError
+    from maxent_jax.choices import ConfigError
 
     with pytest.raises(ConfigError, match="return-steps must be 1"):
         preset("quick", bonus="rnd")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from maxent_jax import envs
-from maxent_jax.config import ConfigError
+from maxent_jax.choices import ConfigError
 from maxent_jax.density import histogram
 from maxent_jax.envs import mountain_car, pendulum
 

@@ -4,7 +4,9 @@ import dataclasses
 
 import pytest
 
-from maxent_jax.config import ENVS, PRESETS, Config, ConfigError, preset
+from maxent_jax.choices import ENVS, ConfigError
+from maxent_jax.config import Config, preset
+from maxent_jax.presets import PRESETS
 
 
 @pytest.mark.parametrize("env", [*ENVS, "brax:halfcheetah", "user:mine"])
@@ -86,14 +88,14 @@ def test_a_hybrid_of_methods_is_named():
 
 
 def test_choices_are_those_of_the_modules_that_make_them():
-    from maxent_jax import bonuses, config, envs, methods, rewards
+    from maxent_jax import bonuses, choices, envs, methods, rewards
 
     torsos = {name: task.torso for name, task in envs.TASKS.items() if task.torso is not None}
-    assert set(config.MUJOCO_ENVS) == set(envs.TASKS)
-    assert set(config.CLASSIC_ENVS) == set(envs.CLASSIC)
-    assert set(config.TORSO_ENVS) == set(torsos)
-    assert set(config.TURNING_ENVS) == {n for n, t in torsos.items() if t.rotate is not None}
-    assert set(config.METHODS) == set(methods.ROWS)
-    assert set(config.BONUSES) == set(bonuses.NAMES)
-    assert set(config.REWARDS) == set(rewards.FORMS)
-    assert set(config.STARTS) == {"method", *methods.STARTS}
+    assert set(choices.MUJOCO_ENVS) == set(envs.TASKS)
+    assert set(choices.CLASSIC_ENVS) == set(envs.CLASSIC)
+    assert set(choices.TORSO_ENVS) == set(torsos)
+    assert set(choices.TURNING_ENVS) == {n for n, t in torsos.items() if t.rotate is not None}
+    assert set(choices.METHODS) == set(methods.ROWS)
+    assert set(choices.BONUSES) == set(bonuses.NAMES)
+    assert set(choices.REWARDS) == set(rewards.FORMS)
+    assert set(choices.STARTS) == {"method", *methods.STARTS}

@@ -15,7 +15,8 @@ from pathlib import Path
 import pytest
 
 from maxent_jax import integrity, runs
-from maxent_jax.config import ConfigError, preset
+from maxent_jax.choices import ConfigError
+from maxent_jax.config import preset
 from maxent_jax.devices import make_mesh
 
 ROOT = Path(__file__).parent.parent

@@ -11,7 +11,7 @@ from brax import envs as brax_envs
 from brax.envs.wrappers import training
 
 from maxent_jax import envs, features
-from maxent_jax.config import BACKENDS, BRAX_ENVS, ENVS, PHYSICS, ConfigError
+from maxent_jax.choices import BACKENDS, BRAX_ENVS, ENVS, PHYSICS, ConfigError
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import task
 

@@ -11,7 +11,8 @@ import pytest
 from untrained import make_run
 
 from maxent_jax import gymnasium_play, mixture
-from maxent_jax.config import ConfigError, preset
+from maxent_jax.choices import ConfigError
+from maxent_jax.config import preset
 
 ROBOTS = {
     "ant": dict(torque_limit=0.4, end_flipped=True, policy_inputs="heading"),

@@ -10,7 +10,8 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "maxent_jax"
 # The reading order of the package, first to last.
 ORDER = [
-    *("types", "config", "convergence", "runs", "integrity", "headless", "runtime", "native"),
+    *("types", "choices", "presets", "config", "convergence"),
+    *("runs", "integrity", "headless", "runtime", "native"),
     *("density.histogram", "density.knn", "density.sharding"),
     *("density.entropy", "density.reservoir"),
     *("envs.physics", "envs.mjx_backend", "envs.mujoco_backend", "envs.torso", "envs.task"),

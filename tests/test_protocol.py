@@ -13,7 +13,8 @@ import pytest
 from experiments import cli, driver, protocol, raw, reproduce
 from experiments.protocol import Cell
 from maxent_jax import runs
-from maxent_jax.config import ConfigError, preset
+from maxent_jax.choices import ConfigError
+from maxent_jax.config import preset
 from maxent_jax.features import make_feature_map
 
 TOY = ["--scale", "toy", "--seeds", "1"]

@@ -19,7 +19,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an optio
 from brax import envs as brax_envs
 from brax.envs.base import Env
 
-from maxent_jax.config import ConfigError, check_env, check_physics
+from maxent_jax.choices import ConfigError, check_env, check_physics
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import ant, humanoid, mountain_car, pendulum, walker2d
 from maxent_jax.envs.physics import REFERENCE, Options, PhysicsState

@@ -12,7 +12,7 @@ import mujoco
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver
 
-from maxent_jax.config import ConfigError
+from maxent_jax.choices import ConfigError
 from maxent_jax.envs.physics import Derived, Physics, PhysicsState
 
 WARP_CONTACTS = 2**17  # contacts that Warp has room for, all environments together

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 from brax.envs.base import Env, State
 
-from maxent_jax.config import BACKENDS, PHYSICS, ConfigError, check_choice
+from maxent_jax.choices import BACKENDS, PHYSICS, ConfigError, check_choice
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import mjx_backend, mujoco_backend, physics
 from maxent_jax.envs.physics import Derived, Options, PhysicsState

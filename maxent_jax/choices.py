@@ -1,0 +1,62 @@
+"""The names that settings are chosen by, and the refusal of others. Loads no array library."""
+
+import difflib
+from collections.abc import Collection
+
+MUJOCO_ENVS = ("ant", "walker2d", "humanoid")
+CLASSIC_ENVS = ("pendulum", "mountain_car")
+ENVS = MUJOCO_ENVS + CLASSIC_ENVS
+BRAX_ENVS = (
+    *("ant", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum"),
+    *("inverted_double_pendulum", "pusher", "reacher", "swimmer", "walker2d"),
+)
+TORSO_ENVS = ("ant", "humanoid")  # a floating torso has a heading, and can be upside down
+TURNING_ENVS = ("ant",)  # whose observation we know how to turn about the vertical
+BONUSES = ("rnd", "icm", "ngu", "re3", "rise", "renyi", "vcse", "kmeans", "apt", "histogram")
+BASELINES = BONUSES[:-1]  # methods that one policy learns, paid by the bonus of that name
+METHODS = ("h", "la", "v", "h-official", *BASELINES)
+BACKENDS = ("auto", "mjx", "mujoco", "warp")
+PHYSICS = ("reference", "fast")
+REWARDS = ("log1p", "linear", "log", "paper")
+INPUTS = ("state", "heading")
+SPACES = ("features", "position")
+REPLAY_DTYPES = ("float32", "float16")
+CORRECTIVE = "fully_corrective"
+WEIGHTS = ("method", "uniform", "geometric", "last", CORRECTIVE)
+MIXINGS = ("episode", "step")
+REFERENCES = ("method", "mixture", "history")
+STARTS = ("method", "scratch", "last", "best")
+BY_METHOD = -1
+
+
+class ConfigError(ValueError):
+    """A setting that no run can have; the message says which, and what to do."""
+
+
+def check_env(name: str) -> None:
+    """Raises ConfigError unless an environment can have that name."""
+    names = (*ENVS, *(f"brax:{env}" for env in BRAX_ENVS))
+    if not name.startswith("user:"):
+        check_choice("env", name, names)
+
+
+def check_physics(env: str, backend: str, physics: str) -> None:
+    """Raises ConfigError where the environment has no such backend or physics."""
+    check_choice("backend", backend, BACKENDS)
+    check_choice("physics", physics, PHYSICS)
+    if env in MUJOCO_ENVS or env.startswith("user:"):
+        return
+    backends = ("auto",) if env in CLASSIC_ENVS else ("auto", "mjx")
+    if backend not in backends:
+        raise ConfigError(f"backend is {backend}, but {env} has only: {', '.join(backends)}.")
+    if physics != "reference":
+        raise ConfigError(f"physics is {physics}, but {env} has only: reference.")
+
+
+def check_choice(what: str, value: str, known: Collection[str]) -> None:
+    """Raises ConfigError unless the value is among the known ones; it names the nearest."""
+    if value in known:
+        return
+    nearest = difflib.get_close_matches(value, known, n=1, cutoff=0.4)
+    hint = f"did you mean '{nearest[0]}'?" if nearest else f"choose one of {', '.join(known)}."
+    raise ConfigError(f"unknown {what} '{value}': {hint}")
