@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 
+from experiments import raw
 from experiments.raw import COLUMNS, Row
 from maxent_jax import mepol, parts, runs
 from maxent_jax.config import Config
@@ -30,8 +31,8 @@ def rows(directory: Path, config: Config, num_seeds: int) -> list[Row]:
     if path.exists():
         held = json.loads(path.read_text())
         if {name: held.get(name) for name in asked} == asked:
-            return held["rows"]
-    found = runs.jsonable(_train(config, num_seeds))
+            return [raw.known(row) for row in held["rows"]]
+    found = _train(config, num_seeds)
     runs.write_json(path, asked | {"versions": runs.stack(), "rows": found})
     return found
 

@@ -1,6 +1,7 @@
 """The raw values of a study's runs: a row for each seed and iteration, and CSV files of them."""
 
 import csv
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -33,10 +34,20 @@ def read(directory: Path, cells: Sequence[Cell]) -> list[Row]:
                 seed = cell.config.seed + index
                 head: Row = {"env": cell.config.env, "method": cell.method, "seed": seed}
                 own = {k: v[index] if isinstance(v, list) else v for k, v in row.items()}
-                found.append(head | {name: own[name] for name in COLUMNS[3:] if name in own})
+                found.append(head | known(own))
                 if cell.method == first and "random_coverage" in own:
                     found.append(head | _of_random(own))
     return sorted(found, key=lambda row: (row["env"], row["method"] == RANDOM))
+
+
+def known(row: Row) -> Row:
+    """What the columns ask for, of a row that was kept as JSON.
+
+    That knows no infinity, and of the measures a single one can leave the finite numbers, to one
+    side: where states coincide, their entropy in features is -inf.
+    """
+    own = {name: row[name] for name in COLUMNS if name in row}
+    return {name: -math.inf if value is None else value for name, value in own.items()}
 
 
 def write(path: Path, rows: Sequence[Row]) -> None:

@@ -5,7 +5,7 @@ arXiv 2108.13264. Scores are lists of arrays, one array of seeds for each task.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from scipy import stats
@@ -13,6 +13,7 @@ from scipy import stats
 Scores = Sequence[np.ndarray]
 RESAMPLES = 2000
 CONFIDENCE = 0.95
+EXACT: Final = "inverted_cdf"  # percentiles are values that were found: between -inf and others lies none
 
 
 def interquartile_mean(scores: Scores) -> float:
@@ -54,7 +55,7 @@ def interval(
         for _ in range(resamples)
     ]
     outside = 50 * (1 - CONFIDENCE)
-    low, high = np.percentile(found, [outside, 100 - outside])
+    low, high = np.percentile(found, [outside, 100 - outside], method=EXACT)
     return float(low), float(high)
 
 
@@ -67,7 +68,7 @@ def interval_of_curves(curves: np.ndarray, seed: int = 0) -> tuple[np.ndarray, .
     rows = random.integers(len(curves), size=(RESAMPLES, len(curves)))
     found = stats.trim_mean(curves[rows], 0.25, axis=1)  # [resamples, T]
     outside = 50 * (1 - CONFIDENCE)
-    low, high = np.percentile(found, [outside, 100 - outside], axis=0)
+    low, high = np.percentile(found, [outside, 100 - outside], axis=0, method=EXACT)
     return stats.trim_mean(curves, 0.25, axis=0), low, high
 
 

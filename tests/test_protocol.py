@@ -241,6 +241,17 @@ def test_seeds_side_by_side_are_told_apart(tmp_path):
     ]
 
 
+def test_an_entropy_that_json_cannot_hold_is_the_lowest_of_all(tmp_path):
+    cell = Cell("V", preset("smoke", env="pendulum"))
+    row = dict.fromkeys(raw.COLUMNS[3:], 1.0) | {"mixture_knn_entropy": -np.inf}
+    (tmp_path / cell.name).mkdir()
+    runs.append_metrics(tmp_path / cell.name, row)
+    (found,) = raw.read(tmp_path, [cell])
+    assert found["mixture_knn_entropy"] == -np.inf and found["mixture_entropy"] == 1
+    raw.write(tmp_path / "raw.csv", [found])
+    assert "-inf" in (tmp_path / "raw.csv").read_text()
+
+
 def test_fig2_is_what_a_solver_of_quadratic_programs_finds(tmp_path):
     from scipy import optimize
 

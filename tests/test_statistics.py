@@ -47,3 +47,13 @@ def test_curves_are_drawn_whole():
     np.testing.assert_allclose(middle, [1.5, -1.5])
     np.testing.assert_allclose(low, -high[::-1])
     assert (low <= middle).all() and (middle <= high).all() and (low < high).all()
+
+
+def test_a_run_at_minus_infinity_counts_as_the_worst_and_spoils_nothing():
+    values = np.array([-np.inf, 1.0, 2.0, 3.0, 4.0])
+    low, high = statistics.interval(statistics.interquartile_mean, [values])
+    assert statistics.interquartile_mean([values]) == 2.0
+    assert low == -np.inf and 2.0 < high <= 4.0
+    assert statistics.probability_of_improvement([values[1:]], [values[:1]]) == 1.0
+    middle, below, above = statistics.interval_of_curves(values[:, None])
+    assert (middle, below) == (2.0, -np.inf) and 2.0 < above <= 4.0
