@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from experiments.raw import RANDOM
 from experiments.statistics import interval_of_curves
@@ -79,15 +80,18 @@ def curves(groups: Sequence[tuple[str, str, Columns]], title: str) -> Figure:
     rows = [(env, quantity) for env in envs for quantity in QUANTITIES]
     figure = Figure(figsize=(13, 2.7 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), len(AXES), sharey="row", squeeze=False)
-    colors = _colors([method for _, method, _ in groups])
+    styles = _styles([method for _, method, _ in groups])
+    opacity = 0.2 if len(styles) <= len(OTHERS) else 0.06
     for (env, (name, label)), row in zip(rows, axes, strict=True):
         for _, method, columns in (group for group in groups if group[0] == env):
             if name in columns:
-                _draw(row, columns, name, method, colors[method])
+                _draw(row, columns, name, opacity, label=method, **styles[method])
         row[0].set_ylabel(label if len(envs) == 1 else f"{env}: {label}")
         row[0].set_ylim(bottom=0)
     for ax, (_, label, _) in zip(axes[-1], AXES, strict=True):
         ax.set_xlabel(label)
+    for ax in axes[:, 0]:
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, frameon=False, ncols=6, loc="outside lower center")
     seeds = max(len(columns["env_steps"]) for _, _, columns in groups)
@@ -111,16 +115,16 @@ def occupancies(directories: Mapping[str, Path]) -> Figure:
     return figure
 
 
-def _draw(row: Sequence[Axes], columns: Columns, name: str, method: str, color: str) -> None:
+def _draw(row: Sequence[Axes], columns: Columns, name: str, opacity: float, **style: Any) -> None:
     middle, low, high = interval_of_curves(columns[name])
     for ax, (axis, _, factor) in zip(row, AXES, strict=True):
         ax.grid(alpha=0.25)
-        if method == RANDOM and axis == "gradient_steps":
-            ax.axhline(middle[-1], ls=":", lw=1, color=color)
+        if style["label"] == RANDOM and axis == "gradient_steps":
+            ax.axhline(middle[-1], linestyle=":", lw=1, color=style["color"])
             continue
         x = columns[axis].mean(0) * factor
-        ax.plot(x, middle, "-o", ms=3, color=color, label=method)
-        ax.fill_between(x, low, high, color=color, alpha=0.2, lw=0)
+        ax.plot(x, middle, marker="o", ms=3, **style)
+        ax.fill_between(x, low, high, color=style["color"], alpha=opacity, lw=0)
 
 
 def _band(ax: Axes, values: np.ndarray, label: str, color: str) -> None:
@@ -130,7 +134,10 @@ def _band(ax: Axes, values: np.ndarray, label: str, color: str) -> None:
     ax.fill_between(rounds, low, high, color=color, alpha=0.2, lw=0)
 
 
-def _colors(methods: Sequence[str]) -> dict[str, str]:
-    """By method: the same one in every figure for those of the paper."""
-    others = iter(OTHERS * 2)
-    return {m: COLORS.get(m) or next(others) for m in dict.fromkeys(methods)}
+def _styles(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """By method: the same colour in every figure for those of the paper; once the others' are used
+    up, they come again, dashed.
+    """
+    others = iter([(color, line) for line in ("-", "--") for color in OTHERS])
+    chosen = {m: (COLORS[m], "-") if m in COLORS else next(others) for m in dict.fromkeys(methods)}
+    return {m: {"color": color, "linestyle": line} for m, (color, line) in chosen.items()}

@@ -13,7 +13,7 @@ from scipy import stats
 Scores = Sequence[np.ndarray]
 RESAMPLES = 2000
 CONFIDENCE = 0.95
-EXACT: Final = "inverted_cdf"  # percentiles are values that were found: between -inf and others lies none
+EXACT: Final = "inverted_cdf"  # percentiles are values that were found: none lies beside -inf
 
 
 def interquartile_mean(scores: Scores) -> float:
