@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from experiments import protocol, statistics
+from experiments.cli import UsageError
 from maxent_jax import mixture, official, runs
 
 SEEDS = {"toy": 2, "cpu": 10, "paper": 10}
@@ -29,17 +30,38 @@ def results(directory: Path, scale: str, num_seeds: int | None) -> Results:
     """By environment; computed once, and read from the directory's file afterwards.
 
     All weightings and seeds of an environment are one program.
+
+    Raises:
+      UsageError: the directory holds it at another scale, or with other seeds or settings.
     """
     path = directory / RESULTS
     seeds = num_seeds or SEEDS[scale]
     asked = {"scale": scale, "seeds": seeds}
+    settings = {env: _settings(env, scale) for env in official.SETTINGS}
     if path.exists():
-        held = json.loads(path.read_text())
-        if {name: held.get(name) for name in asked} == asked:
-            return held["results"]
-    found = {env: _run(env, scale, seeds) for env in official.SETTINGS}
+        held = _read(path)
+        used = {env: of_env.get("settings") for env, of_env in held.get("results", {}).items()}
+        wanted = runs.jsonable({env: s._asdict() for env, s in settings.items()})
+        if {name: held.get(name) for name in asked} | used != asked | wanted:
+            raise UsageError(
+                f"{path} was made at another scale, or with other seeds or settings: choose "
+                f"another --out."
+            )
+        return held["results"]
+    found = {env: _run(settings[env], seeds) for env in settings}
     runs.write_json(path, asked | {"versions": runs.stack(), "results": found})
     return runs.jsonable(found)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError):
+        raise UsageError(f"{path} cannot be read: choose another --out.") from None
+
+
+def _settings(env: str, scale: str) -> official.Settings:
+    return official.SETTINGS[env]._replace(**(TOY if scale == "toy" else {}))
 
 
 def table(found: Results) -> Mapping[str, Any]:
@@ -50,17 +72,14 @@ def table(found: Results) -> Mapping[str, Any]:
     for env, of_env in found.items():
         for name in ("fresh_entropy", "density_entropy", "running_entropy"):
             last = {
-                weighting: [np.array(values[name])[:, -1]]
+                weighting: np.array(values[name])[:, -1]
                 for weighting, values in of_env["weightings"].items()
             }
             summary[f"{env}, {name}"] = statistics.compare(last, "uniform")
     return summary
 
 
-def _run(env: str, scale: str, num_seeds: int) -> dict[str, Any]:
-    settings = official.SETTINGS[env]
-    if scale == "toy":
-        settings = settings._replace(**TOY)
+def _run(settings: official.Settings, num_seeds: int) -> dict[str, Any]:
     weightings = {"uniform": ("uniform", 0.1)} | {
         f"η = {eta}": ("geometric", eta) for eta in protocol.ETAS
     }

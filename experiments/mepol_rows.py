@@ -4,6 +4,7 @@ Its gradient steps are what its trust region allows, far fewer than SAC's, each 
 episodes.
 """
 
+import contextlib
 import dataclasses
 import json
 import time
@@ -28,7 +29,7 @@ def rows(directory: Path, config: Config, num_seeds: int) -> list[Row]:
         {"config": dataclasses.asdict(config), "seeds": num_seeds}
         | {"settings": dataclasses.asdict(settings_of(config))}
     )
-    if path.exists():
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # none yet, or a damaged one
         held = json.loads(path.read_text())
         if {name: held.get(name) for name in asked} == asked:
             return [raw.known(row) for row in held["rows"]]

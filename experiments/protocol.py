@@ -5,9 +5,10 @@ its own. All methods of a study have the same env steps and gradient steps, and 
 same projection. Loads no array library.
 """
 
+import contextlib
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -23,6 +24,8 @@ STUDY, LOCK = "study.json", "lock"
 VERSION = 1  # of a study's directory
 SCALES = ("toy", "cpu", "paper")
 ETAS = (0.1, 0.01, 0.001)
+
+DEFAULTS = {field.name: field.default for field in dataclasses.fields(Config)}
 
 Changes = dict[str, Any]
 
@@ -74,7 +77,13 @@ CLASSIC = {
 THREE: dict[str, Changes] = {name.upper(): {"method": name} for name in ("h", "la", "v")}
 # Ablations of what an iteration does, not of what the iterations add up to, end after two of them.
 ABLATION = ROBOT | {"cpu": Scale("quick", 3, ("ant",), {"num_iterations": 2})}
-UNSHAPED: Changes = {"shaping": 0.0, "shaping_survives_death": False}
+# The learner that the baselines and the published methods have, whatever the preset.
+PLAIN: Changes = {
+    "shaping": 0.0,
+    "shaping_survives_death": False,
+    "return_steps": 1,
+    "reward_scale": 1.0,
+}
 # A method's own choice is left to the method: see `home`.
 REFRESHED: dict[str, Changes] = {
     "every 1": {"method": "la"},
@@ -133,9 +142,9 @@ STUDIES: dict[str, Study] = {
         ABLATION | {"toy": TOY._replace(envs=("ant",))},
     ),
     "published": Study(
-        "H and LA as published, and as the paper reads them, none of them shaped",
+        "H and LA as published, and as the paper reads them, all with one plain learner",
         {
-            **{name: changes | UNSHAPED for name, changes in THREE.items()},
+            **{name: changes | PLAIN for name, changes in THREE.items()},
             "H, official": {"method": "h-official"},
             "APT": {"method": "apt"},
         },
@@ -143,7 +152,7 @@ STUDIES: dict[str, Study] = {
     ),
     "baselines": Study(
         "rewards that the field compares with, one policy each, and V",
-        {"V": {"method": "v"}, **{name: {"method": name} for name in BASELINES}},
+        {"V": {"method": "v"} | PLAIN, **{name: {"method": name} for name in BASELINES}},
         CLASSIC | {"cpu": Scale("quick", 10, ("pendulum",), {"num_iterations": 2})},
         together=True,
         mepol=True,
@@ -185,12 +194,25 @@ def claim(directory: Path, study: str, scale: str, cells: list[Cell]) -> None:
             "cells": {cell.name: dataclasses.asdict(cell.config) for cell in cells},
         }
     )
+    with holding(directory):
+        _claim(directory, content)
+
+
+@contextlib.contextmanager
+def holding(directory: Path) -> Iterator[None]:
+    """Makes a directory, and keeps other processes out of it while inside.
+
+    Raises:
+      UsageError: it cannot be written.
+    """
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        with filelock.FileLock(directory / LOCK):  # processes that share it may begin together
-            _claim(directory, content)
+        lock = filelock.FileLock(directory / LOCK)
+        lock.acquire()
     except OSError as error:
         raise UsageError(f"cannot write to {directory}: {error.strerror}.") from None
+    with lock:
+        yield
 
 
 def _claim(directory: Path, content: Changes) -> None:
@@ -199,7 +221,7 @@ def _claim(directory: Path, content: Changes) -> None:
         try:
             held = json.loads(path.read_text())
             differs = _difference(held, content)
-        except (ValueError, KeyError, TypeError, AttributeError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
             differs = f"its {STUDY} cannot be read"
         if differs:
             raise UsageError(f"{directory} holds another study: {differs}; choose another --out.")
@@ -216,8 +238,10 @@ def _difference(held: Changes, asked: Changes) -> str:
         if held[what] != asked[what]:
             return f"{what} is {held[what]}, not {asked[what]}"
     for name, config in asked["cells"].items():
+        if name not in held["cells"]:
+            continue
         for field, value in config.items():
-            was = held["cells"].get(name, config).get(field, value)
+            was = held["cells"][name].get(field, DEFAULTS[field])
             if was != value:
                 return f"in {name}, {field} was {was} and is {value}"
     return ""
@@ -241,11 +265,18 @@ def _cells(study: Path) -> dict[str, Changes]:
     try:
         held = json.loads(study.read_text())
         return dict(held["cells"]) if held["version"] == VERSION else {}
-    except (ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError):
         return {}
 
 
 def finished(directory: Path, cell: Cell) -> bool:
-    """Whether the cell's run is complete and saved."""
-    names = integrity.checkpoints(home(directory, cell))
-    return names[-1:] == [f"{cell.config.num_iterations}"]
+    """Whether the cell's run is complete and saved.
+
+    Raises:
+      RunError: what is saved there is a run with other settings.
+    """
+    at = home(directory, cell)
+    if integrity.checkpoints(at)[-1:] != [f"{cell.config.num_iterations}"]:
+        return False
+    runs.check_config(at, cell.config)
+    return True

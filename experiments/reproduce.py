@@ -7,6 +7,8 @@ several processes may share a directory, and machines that share none may share 
 
 import dataclasses
 import os
+import re
+import signal
 import subprocess
 import sys
 import time
@@ -17,7 +19,9 @@ from typing import Annotated
 import tyro
 
 from experiments import cli, protocol, train
+from experiments.interruption import SIGNALS
 from experiments.protocol import Cell
+from maxent_jax import runs
 from maxent_jax.choices import check_choice
 
 # What a figure of the paper is made of: studies, by name. Fig. 3's other half, weights on Ant, is
@@ -54,17 +58,22 @@ def main(argv: Sequence[str]) -> None:
     """Parses and checks, and only then trains."""
     arguments = cli.parse(Arguments, argv, "experiments.reproduce")
     index, count = _check(arguments)
-    studies = {
-        name: protocol.make(name, arguments.scale, arguments.seeds)
-        for name in _studies(arguments.what)
-    }
+    whats = tuple(FIGURES) if arguments.what == "all" else (arguments.what,)
+    names = dict.fromkeys(name for what in whats for name in FIGURES.get(what, (what,)))
+    studies = {name: protocol.make(name, arguments.scale, arguments.seeds) for name in names}
     for name, cells in studies.items():
         protocol.claim(arguments.out / name, name, arguments.scale, cells)
-    if arguments.jobs > 1:
+    for what in whats:
+        with protocol.holding(arguments.out / what):  # which it can be, before hours of work
+            pass
+    if studies and arguments.jobs > 1:
         _share(arguments)
     else:
-        for name, cells in studies.items():
-            _train(arguments.out / name, cells[index::count])
+        failures = sum(
+            _train(arguments.out / name, cells[index::count]) for name, cells in studies.items()
+        )
+        if failures:
+            sys.exit(1)
     left = [
         f"{name}/{cell.name}"
         for name, cells in studies.items()
@@ -78,7 +87,6 @@ def main(argv: Sequence[str]) -> None:
         from maxent_jax import runtime
 
         runtime.prepare(simulates_in_jax=False)
-        whats = FIGURES if arguments.what == "all" else (arguments.what,)
         reproduced.draw(whats, arguments.scale, arguments.seeds, arguments.out, studies)
 
 
@@ -90,52 +98,71 @@ def _check(arguments: Arguments) -> tuple[int, int]:
         raise cli.UsageError(f"seeds is {arguments.seeds}, but a study needs at least 1.")
     if arguments.jobs < 1:
         raise cli.UsageError(f"jobs is {arguments.jobs}, but must be at least 1.")
-    index, slash, count = arguments.shard.partition("/")
-    if not (slash and index.isdigit() and count.isdigit() and int(index) < int(count)):
+    shard = re.fullmatch(r"([0-9]+)/([0-9]+)", arguments.shard)
+    if shard is None or int(shard[1]) >= int(shard[2]):
         raise cli.UsageError(f"shard is {arguments.shard}, but must be I/N with 0 <= I < N.")
     if arguments.out.is_file():
         raise cli.UsageError(f"out {arguments.out} is a file: name a folder.")
-    return int(index), int(count)
+    return int(shard[1]), int(shard[2])
 
 
-def _studies(what: str) -> tuple[str, ...]:
-    if what == "all":
-        return tuple(dict.fromkeys(name for names in FIGURES.values() for name in names))
-    return FIGURES.get(what, (what,))
-
-
-def _train(directory: Path, cells: Sequence[Cell]) -> None:
-    """What is left of the cells; those that another process trains are passed over."""
+def _train(directory: Path, cells: Sequence[Cell]) -> int:
+    """What is left of the cells; those that another process trains are passed over, and so is one
+    that cannot be trained, with its sentence. How many those are.
+    """
+    failures = 0
     for cell in cells:
-        if protocol.finished(directory, cell):
-            continue
         started = time.perf_counter()
-        arguments = train.Arguments(cell.config, out=protocol.home(directory, cell), resume=True)
         try:
-            with train.claimed(arguments):
+            if protocol.finished(directory, cell):
+                continue
+            at = protocol.home(directory, cell)
+            with train.claimed(train.Arguments(cell.config, out=at, resume=True)):
                 from experiments import driver  # loads jax
 
-                driver.train(cell.config, arguments.directory, started)
+                driver.train(cell.config, at, started)
         except train.BusyError:
             continue
+        except (runs.RunError, runs.NonFiniteError) as error:
+            print(f"error: {error} Going on with the next.", file=sys.stderr)
+            failures += 1
+    return failures
 
 
 def _share(arguments: Arguments) -> None:
-    """As many processes as jobs, each on its share of the cores, until all have ended."""
+    """As many processes as jobs, each on its share of the cores, until all have ended.
+
+    What this process is told by a signal, it tells them; they save themselves.
+    """
     command = [sys.executable, "-m", "experiments.reproduce", arguments.what, "--no-figures"]
     for name in ("scale", "out", "seeds", "shard"):
         value = getattr(arguments, name)
         command += [] if value is None else [f"--{name}", str(value)]
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    processes = []
-    for i in range(arguments.jobs):
-        processes.append(subprocess.Popen(command))
-        if cores:  # before its threads start, which inherit it
-            mine = cores[i :: arguments.jobs] or cores
-            os.sched_setaffinity(processes[-1].pid, mine)
-    codes = [process.wait() for process in processes]
-    if any(codes):
-        raise cli.UsageError(f"{sum(map(bool, codes))} of {len(codes)} jobs failed: see above.")
+    processes: list[subprocess.Popen[bytes]] = []
+
+    def tell(number: int, _: object) -> None:
+        for process in processes:
+            process.send_signal(number)
+
+    handlers = [signal.signal(number, tell) for number in SIGNALS]
+    try:
+        for i in range(arguments.jobs):
+            # In a group of its own, so that Ctrl-C reaches it once.
+            processes.append(subprocess.Popen(command, process_group=0))
+            if cores:  # before its threads start, which inherit it
+                os.sched_setaffinity(processes[-1].pid, cores[i :: arguments.jobs] or cores)
+        codes = [process.wait() for process in processes]
+    finally:
+        for number, handler in zip(SIGNALS, handlers, strict=True):
+            signal.signal(number, handler)
+    worst = max(code if code >= 0 else 128 - code for code in codes)
+    if worst:
+        print(
+            f"error: {sum(map(bool, codes))} of {len(codes)} jobs did not finish: see above.",
+            file=sys.stderr,
+        )
+        sys.exit(worst)
 
 
 if __name__ == "__main__":

@@ -68,10 +68,15 @@ def study(directory: Path, name: str, cells: Sequence[Cell]) -> None:
             rows += mepol_rows.rows(directory / config.env, config, config.num_seeds)
     raw.write(directory / "raw.csv", rows)
     groups = list(raw.groups(rows))
-    summary = summarise(groups)
-    runs.write_json(directory / "summary.json", {"study": name, "what": _what(name)} | summary)
+    summary: dict[str, Any] = {"study": name, "what": _what(name)}
+    summary |= {"versions": _versions(directory, cells)}
+    summary |= summarise(groups)
+    runs.write_json(directory / "summary.json", summary)
     _save(paper_figures.curves(groups, _what(name)), directory, name)
-    _print(summary["compared_with"], summary["last_iteration"])
+    for env, table in summary["last_iteration"].items():
+        _print(summary["compared_with"], {f"{env}, {name}": table[name] for name in table})
+    if len(summary["versions"]) > 1:
+        print(f"note: the runs were made with {len(summary['versions'])} sets of versions.")
     print(f"{directory / 'raw.csv'}, {directory / 'summary.json'}")
 
 
@@ -84,26 +89,49 @@ def fig5(directory: Path, trained: Path, cells: Sequence[Cell]) -> None:
 
 
 def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[str, Any]:
-    """The last iteration: interquartile means, intervals, and how likely V, or the first method,
-    is to be better than each other.
+    """The last iteration of each environment: interquartile means, intervals, and how likely V, or
+    the first method, is to be better than each other; and that in all environments together.
     """
-    last: dict[str, dict[str, dict[str, np.ndarray]]] = {}
-    for env, method, columns in groups:
-        for name in SUMMARISED:
-            if name in columns:
-                last.setdefault(name, {}).setdefault(method, {})[env] = columns[name][:, -1]
+    envs = sorted({env for env, _, _ in groups})
     names = list(dict.fromkeys(method for _, method, _ in groups))
     ours = "V" if "V" in names else names[0]
+    last = {
+        env: {
+            name: {
+                method: columns[name][:, -1]
+                for at, method, columns in groups
+                if at == env and name in columns
+            }
+            for name in SUMMARISED
+        }
+        for env in envs
+    }
+    everywhere = {
+        name: statistics.improvements(
+            {
+                method: [last[env][name][method] for env in envs]
+                for method in names
+                if all(method in last[env][name] for env in envs)
+            },
+            ours,
+        )
+        for name in SUMMARISED
+    }
     return {
         "compared_with": ours,
         "seeds": len(groups[0][2]["env_steps"]),
         "last_iteration": {
-            name: statistics.compare(
-                {method: list(of_env.values()) for method, of_env in by_method.items()}, ours
-            )
-            for name, by_method in last.items()
+            env: {name: statistics.compare(by_method, ours) for name, by_method in of_env.items()}
+            for env, of_env in last.items()
         },
+        "all_environments": everywhere if len(envs) > 1 else {},
     }
+
+
+def _versions(directory: Path, cells: Sequence[Cell]) -> list[dict[str, str]]:
+    """The stacks that made the runs, each once."""
+    of_cells = [runs.read_versions(protocol.home(directory, cell)) for cell in cells]
+    return [v for i, v in enumerate(of_cells) if v not in of_cells[:i]]
 
 
 def _what(name: str) -> str:

@@ -17,7 +17,10 @@ EXACT: Final = "inverted_cdf"  # percentiles are values that were found: none li
 
 
 def interquartile_mean(scores: Scores) -> float:
-    """The mean of the middle half of all runs of all tasks, which no single run can move far."""
+    """The mean of the middle half of all runs of all tasks, which have one unit.
+
+    From four runs on no single one can move it far; of three it is their mean.
+    """
     return float(stats.trim_mean(np.concatenate(scores), 0.25))
 
 
@@ -43,7 +46,8 @@ def interval(
 
     Args:
       statistic: of as many scores as are given.
-      scores: not empty; with one seed a task the interval is a point, and says nothing.
+      scores: not empty. With one seed a task the interval is a point, and says nothing; with
+        three it holds the mean of normal values three times in four.
     Raises:
       ValueError: a task without seeds.
     """
@@ -72,21 +76,29 @@ def interval_of_curves(curves: np.ndarray, seed: int = 0) -> tuple[np.ndarray, .
     return stats.trim_mean(curves, 0.25, axis=0), low, high
 
 
-def compare(scores: Mapping[str, Scores], ours: str) -> dict[str, dict[str, Any]]:
-    """By name: interquartile mean and interval and, but for `ours` itself, how likely that is to be
-    better, with its interval.
+def compare(scores: Mapping[str, np.ndarray], ours: str) -> dict[str, dict[str, Any]]:
+    """Methods on one task, an array of seeds each: interquartile mean and interval and, but for
+    `ours` itself, how likely that is to be better.
     """
-    found: dict[str, dict[str, Any]] = {}
-    for name, own in scores.items():
-        found[name] = {
-            "interquartile_mean": interquartile_mean(own),
-            "interval": interval(interquartile_mean, own),
+    found = {
+        name: {
+            "interquartile_mean": interquartile_mean([own]),
+            "interval": interval(interquartile_mean, [own]),
             "values": own,
         }
-        if name != ours:
-            both = scores[ours], own
-            found[name] |= {
-                "probability_of_improvement": probability_of_improvement(*both),
-                "probability_interval": interval(probability_of_improvement, *both),
-            }
-    return found
+        for name, own in scores.items()
+    }
+    better = improvements({name: [own] for name, own in scores.items()}, ours)
+    return {name: of_method | better.get(name, {}) for name, of_method in found.items()}
+
+
+def improvements(scores: Mapping[str, Scores], ours: str) -> dict[str, dict[str, Any]]:
+    """By each other name: how likely `ours` is to be better, on all tasks, with its interval."""
+    return {
+        name: {
+            "probability_of_improvement": probability_of_improvement(scores[ours], theirs),
+            "probability_interval": interval(probability_of_improvement, scores[ours], theirs),
+        }
+        for name, theirs in scores.items()
+        if name != ours
+    }

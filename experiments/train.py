@@ -21,7 +21,6 @@ from maxent_jax.config import Config, preset
 
 LOCK = "lock"  # held while a process trains; the system frees a dead one's
 # A preset is a name for values that are compared one by one.
-_FIELDS = [field for field in dataclasses.fields(Config) if field.name != "preset"]
 
 
 class BusyError(cli.UsageError):
@@ -124,13 +123,14 @@ def check_free(arguments: Arguments) -> None:
       UsageError, RunError: it does not.
     """
     directory = arguments.directory
+    begun = {LOCK, runs.temporary_of(directory / runs.CONFIG).name}  # and not yet a run
     taken = directory.is_file() or (
-        directory.is_dir() and any(path.name != LOCK for path in directory.iterdir())
+        directory.is_dir() and any(path.name not in begun for path in directory.iterdir())
     )
     if not taken:
         return
     if arguments.resume:
-        _check_resumed(directory, arguments.config)
+        runs.check_config(directory, arguments.config)
     elif not arguments.overwrite:
         raise cli.UsageError(
             f"{directory} already exists: choose another --out, or add --resume to go on with it "
@@ -148,14 +148,6 @@ def _remove_run(directory: Path) -> None:
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)
-
-
-def _check_resumed(directory: Path, config: Config) -> None:
-    saved = runs.read_config(directory)
-    values = ((f.name, getattr(saved, f.name), getattr(config, f.name)) for f in _FIELDS)
-    changed = [f"{name} was {old} and is {new}" for name, old, new in values if old != new]
-    if changed:
-        raise cli.UsageError(f"{directory} holds a run with other settings: {', '.join(changed)}.")
 
 
 def _check_saving(arguments: Arguments) -> None:

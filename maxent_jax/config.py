@@ -280,6 +280,11 @@ def _check_together(c: Config) -> None:
             f"shaping and episodic-weight 0.",
         ),
         (
+            c.bonus != "none" and c.plateau_segments,
+            f"plateau-segments is {c.plateau_segments}, but is judged by the distance to the "
+            f"reference, which bonus {c.bonus} does not pay.",
+        ),
+        (
             c.mixing == "step" and (c.pooled or c.leave_own_out or c.weights == CORRECTIVE),
             "mixing is step, where no state belongs to a policy: pooled, leave-own-out and fully "
             "corrective weights need mixing episode.",

@@ -152,6 +152,7 @@ def sample(
             distances=jax.tree.map(lambda x: _chosen(x[steps], of_variant), items.distances),
             taken=jnp.stack(taken, axis=-1),
         ),
+        row=first,
     )
 
 

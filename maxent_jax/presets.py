@@ -104,16 +104,9 @@ IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
 _AS_PUBLISHED: dict[str, Any] = dict(
     shaping=0.0, shaping_survives_death=False, episodic_weight=0.0, return_steps=1, reward_scale=1.0
 )
-# Factors that bring a bonus to a size of about 1, which the temperature is made for: measured on
-# normal states of 29 dimensions, where rnd, icm, re3, vcse and apt pay 0.6 to 1.2 as they are.
-_SIZES = {"kmeans": 50.0, "ngu": 0.03, "renyi": 0.03, "rise": 0.25}
 OF_METHOD: dict[str, dict[str, Any]] = {
-    "h-official": _AS_PUBLISHED
-    | dict(bonus="histogram", mixing="step", deterministic=True, leave_own_out=False),
-    **{
-        name: _AS_PUBLISHED | dict(bonus=name, reward_scale=_SIZES.get(name, 1.0))
-        for name in BASELINES
-    },
+    "h-official": _AS_PUBLISHED | dict(bonus="histogram", mixing="step", leave_own_out=False),
+    **{name: _AS_PUBLISHED | dict(bonus=name) for name in BASELINES},
 }
 
 # What the paper does, and how a run that does otherwise says so.

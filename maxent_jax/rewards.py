@@ -108,8 +108,8 @@ def renyi_reward(
 ) -> jax.Array:
     """(α - 1) log p at a state, [B, F] -> [B] nats: high where few states are, if α < 1.
 
-    Up to the factor α / (1 - α) its exponential, p^(α - 1), is the gradient of ∫ p^α, whose
-    logarithm over 1 - α is Rényi's entropy; the smaller α, the more rare states count.
+    Up to the factor α its exponential, p^(α - 1), is the gradient of ∫ p^α, whose logarithm over
+    1 - α is Rényi's entropy; the smaller α, the more rare states count.
 
     Args:
       alpha: the order, in (0, 1); at 1 the entropy is Shannon's and this form is 0.

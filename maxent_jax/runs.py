@@ -100,6 +100,25 @@ def read_config(directory: Path) -> Config:
         raise RunError(f"{path} does not fit this release: {error}") from None
 
 
+def check_config(directory: Path, config: Config) -> None:
+    """Whether the run there has these settings, by whatever preset.
+
+    Raises:
+      RunError: it has not, or there is none.
+    """
+    saved = read_config(directory)
+    names = [field.name for field in dataclasses.fields(Config) if field.name != "preset"]
+    values = ((name, getattr(saved, name), getattr(config, name)) for name in names)
+    changed = [f"{name} was {old} and is {new}" for name, old, new in values if old != new]
+    if changed:
+        raise RunError(f"{directory} holds a run with other settings: {', '.join(changed)}.")
+
+
+def read_versions(directory: Path) -> dict[str, str]:
+    """Of the stack that began the run."""
+    return json.loads((directory / CONFIG).read_text())["versions"]
+
+
 def read_id(directory: Path) -> str:
     """Of the run, drawn when it began."""
     return json.loads((directory / CONFIG).read_text())["id"]
@@ -175,7 +194,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises:
       SaveError: it cannot be written.
     """
-    temporary = path.with_suffix(f".tmp{path.suffix}")
+    temporary = temporary_of(path)
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -183,6 +202,11 @@ def whole_file(path: Path) -> Iterator[Path]:
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def temporary_of(path: Path) -> Path:
+    """The file that `whole_file` writes to before it takes the path's place."""
+    return path.with_suffix(f".tmp{path.suffix}")
 
 
 def _lines(rows: list[dict[str, Any]]) -> str:

@@ -21,6 +21,8 @@ from maxent_jax.sac.agent import Agent
 from maxent_jax.sac.replay import Replay
 from maxent_jax.types import Experience, Metrics, Outcomes, Transition
 
+SMALLEST_SIZE = 1e-8  # of a bonus, as a standard deviation
+
 
 class Visits(NamedTuple):
     """Every state met, as counts; they only grow."""
@@ -49,8 +51,7 @@ class Learner(NamedTuple):
 def init(parts: Parts, key: jax.Array) -> Learner:
     """A fresh learner with fresh episodes, an empty replay, and no reference yet."""
     config, sac = parts.config, parts.sac
-    key_agent, key_episodes = jax.random.split(key)
-    key_bonus = jax.random.fold_in(key, 2)
+    key_agent, key_episodes, key_bonus = jax.random.split(key, 3)
     num_rows = config.num_envs * (2 if config.random_baseline else 1)
     dims = len(parts.phi.names)
     episodes = base.init(parts.env, num_rows, config.num_starts, key_episodes)
@@ -259,11 +260,12 @@ def _paid_by_bonus(
     """The bonus once it has learned from what was drawn, what it paid for it before, [..., 1], and
     what it says of itself.
 
-    It sees features, as every other reward does.
+    It sees features, as every other reward does. What it pays is divided by its standard deviation
+    over all that was drawn: methods say nothing of a scale, which SAC's temperature needs.
     """
     payer = parts.bonus
     assert payer is not None
-    key_value, key_reward, key_learn = jax.random.split(key, 3)
+    key_value, key_learn = jax.random.split(key)
     parameters, outcomes = learner.agent.parameters, drawn.outcomes
     steps = Steps(
         observation=outcomes.features[..., 0, :],
@@ -271,17 +273,20 @@ def _paid_by_bonus(
         next_observation=outcomes.next_features[..., 0, :],
         value=sac_agent.value(parts.sac, parameters, drawn.next_observation, key_value),
         episodic=outcomes.bonus[..., 0],
+        row=drawn.row,
         cell=_cells(parts, drawn.next_observation),
     )
     together = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps)
-    bonus, paid = payer.reward(learner.bonus, together, key_reward)
+    bonus, found = payer.reward(learner.bonus, together)
+    size = jnp.std(found)
+    paid = parts.config.reward_scale * found / jnp.maximum(size, SMALLEST_SIZE)
 
     def learn(bonus, batch_and_key):
         return payer.learn(bonus, *batch_and_key)
 
     keys = jax.random.split(key_learn, steps.value.shape[0])
     bonus, metrics = jax.lax.scan(learn, bonus, (steps, keys))
-    return bonus, parts.config.reward_scale * paid.reshape(*steps.value.shape, 1), metrics
+    return bonus, paid.reshape(*steps.value.shape, 1), metrics | {"bonus_size": size}
 
 
 def _cells(parts: Parts, states: jax.Array) -> jax.Array:

@@ -65,3 +65,4 @@ class Experience(NamedTuple):
     action: jax.Array  # [..., A] the first, in [-1, 1]
     next_observation: jax.Array  # [..., D] after the last that was taken
     outcomes: Outcomes  # [..., n]
+    row: jax.Array  # [...] int32, of the first step in the replay

@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from maxent_jax import algorithm, parts, training
+from maxent_jax import algorithm, experience, methods, parts, training
+from maxent_jax.bonuses import Bonus
 from maxent_jax.choices import BASELINES
 from maxent_jax.config import preset
+from maxent_jax.density import histogram
 
 STEPS = 12
 STILL = ("re3", "rise", "renyi", "vcse")  # have nothing to learn
@@ -79,7 +81,72 @@ def test_ngu_remembers_each_episode_in_its_own_embedding():
 def test_a_baseline_goes_on_from_where_it_was_and_is_its_last_policy():
     config = config_of("rnd")
     method = algorithm.start(config).method
+    assert methods.STARTS[int(method.start)] == "last"
     np.testing.assert_array_equal(method.weights, np.eye(config.archive_size))
+
+
+def test_an_episode_forgets_the_one_before_it():
+    config = config_of("ngu", episode_length=5, reference_size=32)
+    p, state = parts.make(config), algorithm.start(config)
+
+    @jax.jit
+    def run(learner, keys):
+        step = functools.partial(training.step, p, state.method)
+        return jax.lax.scan(step, learner, keys)[0]
+
+    learner = run(state.learner, jax.random.split(jax.random.key(5), 7))
+    assert (learner.episodes.age == 2).all()
+    # Of the second episode two states have been left, the rest is the first one's, not looked at.
+    before = run(state.learner, jax.random.split(jax.random.key(5), 7)[:5])
+    changed = np.abs(np.asarray(learner.memory - before.memory)).sum(-1) > 0
+    np.testing.assert_array_equal(changed, [[True, True, False, False, False]] * 4)
+
+
+def payer(column):
+    """A bonus that pays one column of what it is shown, and counts what it has learned from."""
+    return Bonus(
+        init=lambda key: jnp.zeros(()),
+        reward=lambda state, steps: (state, column(steps) * (1 + state)),
+        learn=lambda state, steps, key: (state + steps.value.shape[0], {}),
+    )
+
+
+COLUMNS = {
+    "where it came from": lambda steps: steps.observation[:, 0],
+    "where it went": lambda steps: steps.next_observation[:, 0],
+    "what it did": lambda steps: steps.action[:, 0],
+    "the cell": lambda steps: steps.cell.astype(jnp.float32),
+    "the row": lambda steps: steps.row.astype(jnp.float32),
+}
+
+
+@pytest.mark.parametrize("what", COLUMNS)
+def test_a_bonus_is_shown_what_was_drawn_and_pays_before_it_learns(what):
+    config = config_of("rnd", updates_per_step=0.5)
+    p = parts.make(config)._replace(bonus=payer(COLUMNS[what]))
+    state = algorithm.start(config)
+    learner = state.learner._replace(bonus=jnp.zeros(()))
+    step = jax.jit(functools.partial(training.step, p, state.method))
+    for key in jax.random.split(jax.random.key(5), 4):
+        learner, _ = step(learner, key)
+    drawn = experience.sample(p, learner.replay, learner.episodes.starts.obs, (2, 16), key)
+    bonus, paid, metrics = training._paid_by_bonus(p, learner, drawn, key)
+
+    rows = np.asarray(drawn.row)
+    items = learner.replay.items
+    at = drawn.next_observation
+    cells = histogram.cells(at.reshape(-1, at.shape[-1]), p.grid).reshape(2, 16)
+    shown = {
+        "where it came from": np.asarray(p.phi(drawn.observation))[..., 0],
+        "where it went": np.asarray(p.phi(at))[..., 0],
+        "what it did": np.asarray(items.action)[rows][..., 0],
+        "the cell": np.asarray(cells),
+        "the row": rows,
+    }[what]
+    learned = 4 * 2 * 16
+    np.testing.assert_allclose(metrics["bonus_size"], (1 + learned) * shown.std(), rtol=1e-4)
+    np.testing.assert_allclose(paid[..., 0], shown / shown.std(), rtol=1e-4, atol=1e-5)
+    assert int(bonus) == learned + 2 * 16
 
 
 def test_stale_rewards_stay_as_they_were_paid():
@@ -115,6 +182,8 @@ def test_what_a_bonus_cannot_have_is_said():
 
     with pytest.raises(ConfigError, match="return-steps must be 1"):
         preset("quick", bonus="rnd")
+    with pytest.raises(ConfigError, match="which bonus rnd does not pay"):
+        preset("quick", method="rnd", plateau_segments=3)
     with pytest.raises(ConfigError, match="leave it to the method"):
         preset("smoke", method="rnd", bonus="icm")
     with pytest.raises(ConfigError, match="no state belongs to a policy"):

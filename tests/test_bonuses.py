@@ -9,7 +9,7 @@ import pytest
 from scipy.special import digamma
 
 from maxent_jax import bonuses
-from maxent_jax.bonuses import Setting, Steps, kmeans, moments, ngu, rise, vcse
+from maxent_jax.bonuses import Setting, Steps, kmeans, moments, ngu, particles, rise, vcse
 
 D, A, B = 3, 2, 24
 SCALE = np.array([0.5, 2.0, 10.0], np.float32)
@@ -34,8 +34,8 @@ def steps_of(seed=0, size=B, spread=1.0):
 def steps(before, action, after, value=0.0, episodic=1.0):
     size = len(after)
     columns = (before, action, after, np.broadcast_to(value, size), np.full(size, episodic))
-    cell = np.arange(size, dtype=np.int32) % (CELLS + 1)
-    return Steps(*(np.asarray(column, np.float32) for column in columns), cell=cell)
+    row = np.arange(size, dtype=np.int32)
+    return Steps(*(np.asarray(column, np.float32) for column in columns), row, row % (CELLS + 1))
 
 
 def arriving(after):
@@ -85,7 +85,7 @@ def made(name):
     bonus = bonuses.make(name, D, A, jnp.asarray(SCALE), RATE, CELLS)
 
     def step(state, batch, key):
-        state, reward = bonus.reward(state, batch, key)
+        state, reward = bonus.reward(state, batch)
         state, metrics = bonus.learn(state, batch, key)
         return state, reward, metrics
 
@@ -119,8 +119,8 @@ class TestEveryBonus:
         state = jax.eval_shape(init, KEY)
         assert not any(x.weak_type for x in jax.tree.leaves(state))
         batch = steps_of()
-        for function in (bonus.reward, bonus.learn):
-            after, others = jax.eval_shape(function, state, batch, KEY)
+        for function, rest in ((bonus.reward, ()), (bonus.learn, (KEY,))):
+            after, others = jax.eval_shape(function, state, batch, *rest)
             assert kinds(after) == kinds(state)
             assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(others))
         if bonus.episodic is None:
@@ -156,9 +156,9 @@ def test_a_name_a_scale_or_a_batch_that_does_not_fit_is_refused():
     for name, least in (("re3", 3), ("rise", 5), ("renyi", 5), ("apt", 12), ("vcse", 12)):
         bonus = bonuses.make(name, D, A, jnp.ones(D), RATE, CELLS)
         state = jax.eval_shape(bonus.init, KEY)
-        jax.eval_shape(bonus.reward, state, steps_of(size=least + 1), KEY)
+        jax.eval_shape(bonus.reward, state, steps_of(size=least + 1))
         with pytest.raises(ValueError, match=f"too small for {least} neighbours"):
-            jax.eval_shape(bonus.reward, state, steps_of(size=least), KEY)
+            jax.eval_shape(bonus.reward, state, steps_of(size=least))
 
 
 # Running moments.
@@ -440,14 +440,14 @@ FIFTH = np.array([20, 19, 17, 13, 12, 19, 27, 42])  # to the fifth nearest of th
 
 @pytest.mark.parametrize("order", [0.0, 0.1, 0.5])
 def test_rise_pays_a_power_of_the_distance_to_the_fifth_nearest(order):
-    _, reward = rise.reward(setting(1, np.ones(1)), (), arriving(LINE), KEY, order)
+    _, reward = rise.reward(setting(1, np.ones(1)), (), arriving(LINE), order)
     np.testing.assert_allclose(reward, FIFTH ** (1 - order), rtol=1e-6)
 
 
 def test_rise_tells_states_apart_by_the_logarithm_and_ever_less_as_the_order_nears_1():
     spreads = []
     for order in (0.1, 0.5, 0.9, 0.99, 0.999):
-        _, reward = rise.reward(setting(1, np.ones(1)), (), arriving(LINE), KEY, order)
+        _, reward = rise.reward(setting(1, np.ones(1)), (), arriving(LINE), order)
         spreads.append(np.ptp(reward))
         slope = (np.float64(reward) - 1) / (1 - order)
     assert (np.diff(spreads) < 0).all()
@@ -458,9 +458,9 @@ def test_rise_tells_states_apart_by_the_logarithm_and_ever_less_as_the_order_nea
 
 def test_the_bonus_of_rise_has_order_a_tenth_and_that_of_renyi_is_its_logarithm_on_a_line():
     line = setting(1, 2 * np.ones(1, np.float32))
-    state, found = rise.make(line).reward((), arriving(LINE), KEY)
+    state, found = rise.make(line).reward((), arriving(LINE))
     np.testing.assert_allclose(found, (FIFTH / 2) ** 0.9, rtol=1e-6)
-    _, renyi = rise.make_renyi(line).reward(state, arriving(LINE), KEY)
+    _, renyi = rise.make_renyi(line).reward(state, arriving(LINE))
     # On a line 1/density = N · 2R / k, with the N = 7 others.
     np.testing.assert_allclose(renyi, 0.9 * np.log(7 * FIFTH / 5), rtol=1e-5)
 
@@ -479,13 +479,27 @@ def kraskov(states, values, k):
     return distance, (value_apart < distance[:, None]).sum(1)
 
 
+def test_a_transition_drawn_more_than_once_is_not_its_own_neighbour():
+    points = np.float32([0, 0, 0, 1, 3, 7])[:, None]
+    rows = np.int32([4, 4, 4, 2, 9, 0])
+    found = particles.distances(points, rows, 4)
+    np.testing.assert_array_equal(found[0], [1, 3, 7, 7])  # three others; the farthest stands in
+    np.testing.assert_array_equal(found[3], [1, 1, 1, 2])
+    np.testing.assert_array_equal(particles.distances(points[:3], rows[:3], 2), np.zeros((3, 2)))
+
+    distance, count = vcse.joint_neighbors(points, np.zeros(6, np.float32), rows, 2)
+    assert (distance[0], count[0]) == (3, 3) and (distance[3], count[3]) == (1, 5)
+
+
 def test_joint_neighbors_are_those_of_brute_force_also_beyond_one_block_of_rows():
     rng = np.random.default_rng(0)
     size = vcse.ROWS + 44
     states = rng.normal(size=(size, D)).astype(np.float32)
     values = rng.normal(size=size).astype(np.float32)
     values[:40] = values[0]  # many of one value
-    distance, count = jax.jit(vcse.joint_neighbors, static_argnums=2)(states, values, 12)
+    distance, count = jax.jit(vcse.joint_neighbors, static_argnums=3)(
+        states, values, np.arange(size), 12
+    )
     expected, expected_count = kraskov(states, values, 12)
     np.testing.assert_allclose(distance, expected, rtol=1e-6)
     np.testing.assert_array_equal(count, expected_count)
@@ -497,7 +511,9 @@ def test_vcse_estimates_the_entropy_of_a_gaussian_given_another():
     value = rng.normal(size=size)
     state = correlation * value + np.sqrt(1 - correlation**2) * rng.normal(size=size)
     states, values = np.float32(state)[:, None], np.float32(value)
-    distance, count = jax.jit(vcse.joint_neighbors, static_argnums=2)(states, values, k)
+    distance, count = jax.jit(vcse.joint_neighbors, static_argnums=3)(
+        states, values, np.arange(size), k
+    )
     # In one dimension a ball of radius ε has volume 2ε.
     found = np.mean(digamma(np.asarray(count) + 1.0) + np.log(2 * np.asarray(distance)))
     expected = 0.5 * np.log(2 * np.pi * np.e * (1 - correlation**2))
@@ -529,7 +545,7 @@ def test_vcse_measures_states_among_those_of_their_value_alone():
     both = np.concatenate([low, high])
     value = np.repeat(np.float32([-1, 1]), 40)
     batch = arriving(both * SCALE)._replace(value=value)
-    _, found = jax.jit(functools.partial(vcse.reward, setting()))((), batch, KEY)
+    _, found = jax.jit(functools.partial(vcse.reward, setting()))((), batch)
     for rows, group in ((slice(0, 40), low), (slice(40, 80), high)):
         radius = nearest(group / D, 12)[:, -1]
         # ψ(n + 1) of the 39 others of the group, as long as no other value comes within ε < 2.
@@ -616,9 +632,9 @@ def test_kmeans_pays_for_leaving_the_crowd():
 def test_the_published_reward_of_h_by_hand():
     bonus = bonuses.make("histogram", D, A, jnp.ones(D), RATE, CELLS)
     state = bonus.init(KEY)
-    assert (bonus.reward(state, steps_of(), KEY)[1] == 0).all()  # before there is a mixture
+    assert (bonus.reward(state, steps_of())[1] == 0).all()  # before there is a mixture
     share = jnp.array([[0.5, 0.25, 0.0], [0.0, 0.125, 0.0]])  # and an eighth off the grid
-    _, paid = bonus.reward(bonus.refresh(state, share), steps_of(size=7), KEY)
+    _, paid = bonus.reward(bonus.refresh(state, share), steps_of(size=7))
     smoothing = 1 / np.sqrt(6)
     expected = 1 / (np.array([0.5, 0.25, 0, 0, 0.125, 0, 0.125]) + smoothing)
     np.testing.assert_allclose(paid, expected, rtol=1e-6)  # derived: a few roundings

@@ -47,15 +47,14 @@ def init(fixed: Icm, key: jax.Array) -> State:
     return State(icm.init(fixed, key), moments.init())
 
 
-def reward(fixed: Icm, state: State, steps: Steps, key: jax.Array) -> tuple[State, jax.Array]:
+def reward(fixed: Icm, state: State, steps: Steps) -> tuple[State, jax.Array]:
     """The running mean advances before it is used.
 
     Raises:
       ValueError: B <= 12.
     """
-    del key
     embedding = icm.embed(fixed, state.icm.parameters, steps.next_observation)
-    nearest = particles.distances(embedding, NUM_NEIGHBORS)
+    nearest = particles.distances(embedding, steps.row, NUM_NEIGHBORS)
     state = state._replace(distances=moments.update(state.distances, nearest.reshape(-1)))
     relative = nearest / jnp.maximum(state.distances.mean, MEAN_FLOOR)
     return state, jnp.log1p(jnp.mean(jnp.maximum(relative - DISTANCE_CLIP, 0.0), axis=-1))

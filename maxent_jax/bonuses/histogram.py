@@ -1,8 +1,10 @@
 """MaxEnt-H's reward as published: 1/(p + ε), p the mixture's density in the cell that is reached.
 
 Hazan et al. 2019, in the code of github.com/abbyvansoest/maxent, where ε = 1/sqrt(cells) and p
-comes from rollouts of the mixture as an iteration begins. There states off the grid count to its
-outermost cells; here all of them together are one cell more.
+comes from rollouts of the mixture as an iteration begins. There the Ant's grid is of x, y and five
+random projections of the rest, 1.9e8 cells; here it is that of the coverage, two-dimensional, and
+the joints do not enter. There states off the grid count to its outermost cells; here all of them
+together are one cell more. There rollouts go on where health fails; here they end.
 """
 
 import functools
@@ -44,8 +46,7 @@ def refresh(state: State, share: jax.Array) -> State:
     return State(1 / (density + on_grid.shape[0] ** -0.5))
 
 
-def reward(state: State, steps: Steps, key: jax.Array) -> tuple[State, jax.Array]:
+def reward(state: State, steps: Steps) -> tuple[State, jax.Array]:
     """[B], of `steps.cell`."""
-    del key
     assert steps.cell is not None
     return state, state.payment[steps.cell]

@@ -78,9 +78,8 @@ def init(icm: Icm, key: jax.Array) -> Learned:
     return descent.begin(icm.optimizer, parameters)
 
 
-def reward(icm: Icm, state: Learned, steps: Steps, key: jax.Array) -> tuple[Learned, jax.Array]:
+def reward(icm: Icm, state: Learned, steps: Steps) -> tuple[Learned, jax.Array]:
     """log(1 + length of the forward error)."""
-    del key
     forward, _ = errors(icm, state.parameters, steps)
     return state, jnp.log1p(forward)
 

@@ -46,9 +46,8 @@ def init(setting: Setting, key: jax.Array) -> State:
     return State(centers, jnp.zeros(NUM_CENTERS, jnp.int32))
 
 
-def reward(setting: Setting, state: State, steps: Steps, key: jax.Array) -> tuple[State, jax.Array]:
+def reward(setting: Setting, state: State, steps: Steps) -> tuple[State, jax.Array]:
     """What each state alone would add to the sum of roots, were its centre to follow it."""
-    del key
     states = protocol.scaled(setting, steps.next_observation)
     chosen = nearest_center(state, states)
     moved = _moved(state.centers[chosen], states)

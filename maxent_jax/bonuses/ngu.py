@@ -126,9 +126,8 @@ def novelty(
     return state._replace(distances=distances), 1 / similarity
 
 
-def reward(ngu: Ngu, state: State, steps: Steps, key: jax.Array) -> tuple[State, jax.Array]:
+def reward(ngu: Ngu, state: State, steps: Steps) -> tuple[State, jax.Array]:
     """The stored novelty, times RND's modulator, whose normalisers advance before they are used."""
-    del key
     lifelong, error = rnd.advance(ngu.rnd, state.rnd, steps)
     std = jnp.sqrt(lifelong.errors.variance) + rnd.STD_FLOOR
     modulator = jnp.clip(1 + (error - lifelong.errors.mean) / std, 1.0, MODULATOR_LIMIT)

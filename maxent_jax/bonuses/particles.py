@@ -6,17 +6,22 @@ import jax.numpy as jnp
 from maxent_jax.density.knn import knn_distances
 
 
-def distances(points: jax.Array, num_neighbors: int) -> jax.Array:
+def distances(points: jax.Array, rows: jax.Array, num_neighbors: int) -> jax.Array:
     """Distances from each point [B, F] to its k nearest others, ascending, [B, k].
 
-    A point leaves itself out by its index. The code of RE3, APT and VCSE sorts it among its
-    neighbours, so that their k counts one neighbour fewer, but in RE3, which asks for k + 1.
+    A point leaves itself out, and every copy of it, by its row [B]. The code of RE3, APT and VCSE
+    sorts it among its neighbours, so that their k counts one neighbour fewer, but in RE3, which
+    asks for k + 1.
+
+    Where copies leave fewer than k others, the farthest of them stands for those that are missing.
 
     Raises:
       ValueError: B <= k.
     """
     check(points.shape[0], num_neighbors)
-    return knn_distances(points, points, num_neighbors, exclude=jnp.arange(points.shape[0]))
+    found = knn_distances(points, points, num_neighbors, exclude=rows, labels=rows)
+    farthest = jnp.max(jnp.where(jnp.isfinite(found), found, 0.0), axis=-1, keepdims=True)
+    return jnp.where(jnp.isfinite(found), found, farthest)
 
 
 def check(batch_size: int, num_neighbors: int) -> None:

@@ -2,7 +2,9 @@
 
 Every bonus pays for the state that a transition reached. It meets transitions drawn from a replay,
 as in URLB (Laskin et al. 2021, github.com/rll-research/url_benchmark): what its method computes
-from the newest rollout, it computes from the batch.
+from the newest rollout, it computes from the batch. Rewards are computed for all minibatches of a
+step of all envs together, before it learns from one after the other. What it is shown as a state's
+observation is φ of it.
 """
 
 from collections.abc import Callable
@@ -30,6 +32,7 @@ class Steps(NamedTuple):
     next_observation: jax.Array  # [B, D]
     value: jax.Array  # [B] what the critics expect from next_observation on
     episodic: jax.Array  # [B] what Episodic.novelty gave when the step was taken; 0 without one
+    row: jax.Array  # [B] int32, equal for one and the same transition, drawn more than once
     cell: jax.Array | None = None  # [B] int32 of the grid, that the step reached; num_cells off it
 
 
@@ -51,8 +54,8 @@ class Bonus(NamedTuple):
 
     init: Callable[[jax.Array], State]
     """key -> state"""
-    reward: Callable[[State, Steps, jax.Array], tuple[State, jax.Array]]
-    """state, steps, key -> state with its running normalisers advanced, reward [B]"""
+    reward: Callable[[State, Steps], tuple[State, jax.Array]]
+    """state, steps -> state with its running normalisers advanced, reward [B]"""
     learn: Callable[[State, Steps, jax.Array], tuple[State, Metrics]]
     """state, steps, key -> state after one step of learning; the same where nothing is learned"""
     episodic: Episodic | None = None

@@ -50,13 +50,12 @@ def init(re3: Re3, key: jax.Array) -> Any:
     return re3.encoder.init(key, jnp.zeros((1, re3.setting.observation_size)))
 
 
-def reward(re3: Re3, state: Any, steps: Steps, key: jax.Array) -> tuple[Any, jax.Array]:
+def reward(re3: Re3, state: Any, steps: Steps) -> tuple[Any, jax.Array]:
     """log(1 + R).
 
     Raises:
       ValueError: B <= 3.
     """
-    del key
     inputs = protocol.scaled(re3.setting, steps.next_observation)
     embedding = cast(jax.Array, re3.encoder.apply(state, inputs))
-    return state, jnp.log1p(particles.distances(embedding, NUM_NEIGHBORS)[:, -1])
+    return state, jnp.log1p(particles.distances(embedding, steps.row, NUM_NEIGHBORS)[:, -1])

@@ -3,8 +3,8 @@
 Yuan, Pun & Wang 2022, "Rényi state entropy for exploration acceleration in reinforcement learning",
 arXiv 2203.04297: R^(1 - α), R the distance to the k-th nearest. Images are embedded by a VAE that a
 random policy trains; their code (github.com/yuanmingqi/RISE, `src/rise.py`) takes the states of
-continuous control as they are, and so do we. Its k + 1 steps over the state itself and one more
-neighbour; ours is the k-th. The paper's search for k is not in its code, and not here.
+continuous control as they are; here they are φ, in its units. Its k + 1 steps over the state itself
+and one more neighbour; ours is the k-th. The paper's search for k is not in its code, and not here.
 """
 
 import functools
@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from maxent_jax import rewards
 from maxent_jax.bonuses import particles, protocol
 from maxent_jax.bonuses.protocol import Bonus, Setting, State, Steps
+from maxent_jax.density import entropy
 
 NUM_NEIGHBORS, ORDER = 5, 0.1  # k and alpha of src/rise.py
 
@@ -41,29 +42,26 @@ def make_renyi(setting: Setting) -> Bonus:
 
 
 def reward(
-    setting: Setting, state: State, steps: Steps, key: jax.Array, order: float = ORDER
+    setting: Setting, state: State, steps: Steps, order: float = ORDER
 ) -> tuple[State, jax.Array]:
     """R^(1 - α): at order α = 0 linear in R; towards 1 it no longer tells states apart.
 
     Raises:
       ValueError: B <= 5.
     """
-    del key
     states = protocol.scaled(setting, steps.next_observation)
-    return state, particles.distances(states, NUM_NEIGHBORS)[:, -1] ** (1 - order)
+    return state, particles.distances(states, steps.row, NUM_NEIGHBORS)[:, -1] ** (1 - order)
 
 
-def renyi_reward(
-    setting: Setting, state: State, steps: Steps, key: jax.Array
-) -> tuple[State, jax.Array]:
-    """As rewards.renyi_reward, of each state among the others of the batch.
+def renyi_reward(setting: Setting, state: State, steps: Steps) -> tuple[State, jax.Array]:
+    """(α - 1) log p of each state among the others of the batch, as rewards.renyi_reward, nats.
 
     Raises:
       ValueError: B <= 5.
     """
-    del key
     states = protocol.scaled(setting, steps.next_observation)
-    num_states = states.shape[0]
-    particles.check(num_states, NUM_NEIGHBORS)
-    own = jnp.arange(num_states)
-    return state, rewards.renyi_reward(states, states, NUM_NEIGHBORS, ORDER, exclude=own)
+    nearest = particles.distances(states, steps.row, NUM_NEIGHBORS)[:, -1]
+    distance = jnp.maximum(nearest, rewards.DISTANCE_FLOOR)
+    num_others = states.shape[0] - 1
+    log_p = entropy.log_density(distance, num_others, NUM_NEIGHBORS, states.shape[1])
+    return state, (ORDER - 1) * log_p

@@ -72,9 +72,8 @@ def init(rnd: Rnd, key: jax.Array) -> State:
     )
 
 
-def reward(rnd: Rnd, state: State, steps: Steps, key: jax.Array) -> tuple[State, jax.Array]:
+def reward(rnd: Rnd, state: State, steps: Steps) -> tuple[State, jax.Array]:
     """Both normalisers advance before they are used."""
-    del key
     state, error = advance(rnd, state, steps)
     return state, error / (jnp.sqrt(state.errors.variance) + STD_FLOOR)
 

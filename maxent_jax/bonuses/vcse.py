@@ -5,8 +5,9 @@ exploration", arXiv 2305.19476: ψ(n + 1) / D + log 2ε, where ε is the distanc
 in the larger of the distances of states and of values, and n counts the values nearer than ε, after
 Kraskov, Stögbauer & Grassberger 2004. As in their code (github.com/kingdy2002/VCSE, `VCSE_SAC`),
 states are divided by D too, values normalised over the batch, and 1e-5 is added within the
-logarithm. Their k and n count the state itself; ours, as Kraskov's, do not. Their value is that of
-a critic of the task's reward alone; without such a reward it is the learner's own.
+logarithm. Their k and n count the state itself; ours, as Kraskov's, do not. Their value is
+that of the mean action, by a critic of the task's reward alone; without such a reward it is the
+learner's own, of an action drawn, with its entropy.
 """
 
 import functools
@@ -34,48 +35,50 @@ def make(setting: Setting) -> Bonus:
     )
 
 
-def reward(setting: Setting, state: State, steps: Steps, key: jax.Array) -> tuple[State, jax.Array]:
+def reward(setting: Setting, state: State, steps: Steps) -> tuple[State, jax.Array]:
     """Of each state among the others of the batch.
 
     Raises:
       ValueError: B <= 12.
     """
-    del key
     dims = setting.observation_size
     states = protocol.scaled(setting, steps.next_observation) / dims
     deviation = steps.value - jnp.mean(steps.value)
     values = deviation / jnp.sqrt(jnp.mean(deviation**2) + VARIANCE_FLOOR)
-    distance, count = joint_neighbors(states, values, NUM_NEIGHBORS)
+    distance, count = joint_neighbors(states, values, steps.row, NUM_NEIGHBORS)
     spread = digamma(count.astype(jnp.float32) + 1) / dims
     return state, spread + jnp.log(2 * distance + LOG_OFFSET)
 
 
 def joint_neighbors(
-    states: jax.Array, values: jax.Array, num_neighbors: int
+    states: jax.Array, values: jax.Array, rows: jax.Array, num_neighbors: int
 ) -> tuple[jax.Array, jax.Array]:
     """What Kraskov's first estimator is made of, of each row among the others.
 
     Args:
       states: [B, F].
       values: [B].
+      rows: [B] int32, equal for copies of one transition, which are no others.
       num_neighbors: k.
     Returns:
-      [B] ε, to the k-th nearest in max(distance of states, distance of values); and [B] int32, how
+      [B] ε, to the k-th nearest in max(distance of states, distance of values), or to the farthest
+      where copies leave fewer than k others; and [B] int32, how
       many values lie nearer than ε.
     Raises:
       ValueError: B <= k.
     """
-    num_states = states.shape[0]
-    particles.check(num_states, num_neighbors)
+    particles.check(states.shape[0], num_neighbors)
+    # One rounding of each value, wherever it is used: ε is often itself a distance of values.
+    values = jax.lax.optimization_barrier(values)
 
-    def measure(row):
-        state, value, own = row
+    def measure(one):
+        state, value, own = one
         apart = jnp.sqrt(jnp.sum((states - state[None]) ** 2, axis=-1))
         value_apart = jnp.abs(values - value)
-        other = jnp.arange(num_states) != own
+        other = rows != own
         joint = jnp.where(other, jnp.maximum(apart, value_apart), jnp.inf)
-        distance = smallest_k(joint, num_neighbors)[-1]
+        nearest = smallest_k(joint, num_neighbors)
+        distance = jnp.max(jnp.where(jnp.isfinite(nearest), nearest, 0.0))
         return distance, jnp.sum(other & (value_apart < distance), dtype=jnp.int32)
 
-    rows = states, values, jnp.arange(num_states)
-    return jax.lax.map(measure, rows, batch_size=ROWS)
+    return jax.lax.map(measure, (states, values, rows), batch_size=ROWS)

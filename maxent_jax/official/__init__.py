@@ -19,10 +19,8 @@ part, this follows the code:
 - At the goal training resets the car and goes on. The next action is still chosen for the state at
   the goal, and returns run on through the reset.
 
-The plain reset is that of a fork of gym (abbyvansoest/gym-fork), here known from what seems a copy
-of it in philip-amortila/l1-coverability: a state to reset to serves one reset, and the pendulum's
-other resets are gym's. The car's differ from version to version of that copy (any state; at rest
-anywhere; at rest in [-0.8, -0.2]); taken here are gym's, at rest in [-0.6, -0.4]. For any state
+The plain reset is that of their patch of gym (abbyvansoest/maxent, `gym_patch`): a state to reset
+to serves one reset, and others are gym's, the car's at rest in [-0.6, -0.4]. For any state
 `_replace(reset_low=(-1.2, -0.07), reset_high=(0.6, 0.07))`.
 
 Left out: the online variant, and a run printed as a policy's that plays at random. The physics of
