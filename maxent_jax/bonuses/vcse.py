@@ -23,6 +23,7 @@ from maxent_jax.density.knn import smallest_k
 NUM_NEIGHBORS = 12  # knn_k of VCSE_SAC/config/agent/sac.yaml
 LOG_OFFSET = 1e-5  # of their code
 VARIANCE_FLOOR = 1e-5  # of the values: that of their layer norm
+ROUNDING = 1e-6
 ROWS = 256  # states measured at once, so that memory grows with B and not with its square
 
 
@@ -68,8 +69,6 @@ def joint_neighbors(
       ValueError: B <= k.
     """
     particles.check(states.shape[0], num_neighbors)
-    # One rounding of each value, wherever it is used: ε is often itself a distance of values.
-    values = jax.lax.optimization_barrier(values)
 
     def measure(one):
         state, value, own = one
@@ -79,6 +78,8 @@ def joint_neighbors(
         joint = jnp.where(other, jnp.maximum(apart, value_apart), jnp.inf)
         nearest = smallest_k(joint, num_neighbors)
         distance = jnp.max(jnp.where(jnp.isfinite(nearest), nearest, 0.0))
-        return distance, jnp.sum(other & (value_apart < distance), dtype=jnp.int32)
+        # ε is often itself a distance of values, of which XLA may make another in its last bit.
+        nearer = value_apart < distance * (1 - ROUNDING)
+        return distance, jnp.sum(other & nearer, dtype=jnp.int32)
 
     return jax.lax.map(measure, (states, values, rows), batch_size=ROWS)
