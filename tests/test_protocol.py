@@ -3,14 +3,17 @@
 import csv
 import dataclasses
 import json
+import os
+import signal
 import subprocess
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
-from experiments import cli, driver, protocol, raw, reproduce
+from experiments import cli, driver, protocol, raw, reproduce, reproduced
 from experiments.protocol import Cell
 from maxent_jax import runs
 from maxent_jax.choices import ConfigError
@@ -49,6 +52,20 @@ def test_all_methods_of_a_study_have_one_budget_and_one_environment(name, scale)
         assert len({tuple(of_method) for of_method in seeds.values()}) == 1
 
 
+@pytest.mark.parametrize("scale", protocol.SCALES)
+@pytest.mark.parametrize("name", ["baselines", "published"])
+def test_methods_that_are_compared_by_their_rewards_have_one_learner(name, scale):
+    rewards = {"method", "bonus", "mixing", "leave_own_out"}
+    for cell in (cells := protocol.make(name, scale)):
+        of_env = [other for other in cells if other.config.env == cell.config.env]
+        fields = dataclasses.asdict(cell.config)
+        other = dataclasses.asdict(of_env[0].config)
+        differing = {field for field in fields if fields[field] != other[field]} - {"seed"}
+        if cell.config.method not in ("h", "la", "v"):
+            differing -= {"episodic_weight"}  # which a bonus takes the place of
+        assert differing <= rewards, cell.name
+
+
 @pytest.mark.parametrize("name", protocol.STUDIES)
 def test_all_methods_of_a_study_share_one_projection(name):
     from maxent_jax import parts
@@ -73,6 +90,7 @@ def test_fewer_seeds_are_a_part_of_the_study():
         (["fig4", "--jobs", "0"], "at least 1"),
         (["fig4", "--shard", "2/2"], "0 <= I < N"),
         (["fig4", "--shard", "half"], "0 <= I < N"),
+        (["fig4", "--shard", "²/3"], "0 <= I < N"),
     ],
 )
 def test_bad_input_is_one_sentence_before_anything_is_written(tmp_path, argv, sentence):
@@ -104,6 +122,15 @@ def test_a_directory_belongs_to_one_study_and_may_gain_seeds(tmp_path):
         protocol.claim(directory, "fig4", "cpu", changed)
     with pytest.raises(cli.UsageError, match="scale is cpu, not paper"):
         protocol.claim(directory, "fig4", "paper", protocol.make("fig4", "paper"))
+    name = one[0].name
+    before = {key: value for key, value in held["cells"][name].items() if key != "stale_rewards"}
+    earlier = held | {"cells": held["cells"] | {name: before}}  # of a release without that field
+    (directory / protocol.STUDY).write_text(json.dumps(earlier))
+    protocol.claim(directory, "fig4", "cpu", one)
+    stale = [one[0]._replace(config=dataclasses.replace(one[0].config, stale_rewards=True))]
+    (directory / protocol.STUDY).write_text(json.dumps(earlier))
+    with pytest.raises(cli.UsageError, match="stale_rewards was False and is True"):
+        protocol.claim(directory, "fig4", "cpu", stale)
     (directory / protocol.STUDY).write_text(json.dumps(held | {"version": 0}))
     with pytest.raises(cli.UsageError, match="version is 0, not 1"):
         protocol.claim(directory, "fig4", "cpu", one)
@@ -179,6 +206,94 @@ def test_a_run_that_another_study_has_is_not_trained_again(finished, monkeypatch
     assert protocol.home(out / "weights", uniform) == out / "weights" / uniform.name
 
 
+def test_a_finished_run_with_other_settings_is_no_cell(finished, monkeypatch, capsys):
+    out, _ = finished
+    cell = protocol.make("fig4", "toy", 1)[0]
+    path = out / "fig4" / cell.name / "config.json"
+    kept = path.read_text()
+    content = json.loads(kept)
+    content["config"]["eta"] = 0.5
+    path.write_text(json.dumps(content))
+    trained = []
+    monkeypatch.setattr(driver, "train", lambda config, directory, *_: trained.append(directory))
+    with pytest.raises(SystemExit) as stop:
+        reproduce.main(["fig4", *TOY, "--out", str(out)])
+    path.write_text(kept)
+    assert stop.value.code == 1 and not trained
+    assert "other settings: eta was 0.5 and is 0.1. Going on" in capsys.readouterr().err
+
+
+def test_a_cell_that_cannot_be_trained_does_not_keep_the_others_from_it(
+    tmp_path, monkeypatch, capsys
+):
+    trained = []
+
+    def train(config, directory, *_):
+        trained.append(directory.name)
+        if len(trained) == 1:
+            raise runs.NonFiniteError("the loss is not finite.")
+
+    monkeypatch.setattr(driver, "train", train)
+    with pytest.raises(SystemExit) as stop:
+        reproduce.main(["fig4", *TOY, "--out", str(tmp_path)])
+    assert stop.value.code == 1
+    assert trained == [cell.name for cell in protocol.make("fig4", "toy", 1)]
+    assert "the loss is not finite. Going on with the next." in capsys.readouterr().err
+
+
+def test_a_signal_reaches_the_jobs_and_is_waited_for(tmp_path, monkeypatch, capsys):
+    started = []
+    whole = subprocess.Popen
+
+    def child(_, **options):
+        code = (
+            "import signal, sys, time\n"
+            "signal.signal(signal.SIGTERM, lambda *_: (time.sleep(0.5), sys.exit(143)))\n"
+            "print('ready', flush=True); time.sleep(60)"
+        )
+        started.append(whole([sys.executable, "-c", code], stdout=subprocess.PIPE, **options))
+        assert started[-1].stdout.readline() == b"ready\n"
+        if len(started) == 2:
+            threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        return started[-1]
+
+    monkeypatch.setattr(reproduce.subprocess, "Popen", child)
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as stop:
+        reproduce.main(["fig4", *TOY, "--jobs", "2", "--out", str(tmp_path)])
+    for process in started:
+        process.stdout.close()
+    assert stop.value.code == 143 and [process.poll() for process in started] == [143, 143]
+    assert "2 of 2 jobs did not finish" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_environments_are_summarised_apart_and_never_confused():
+    """Cells of 64 and of 132, with rows of a method appended in another order of environments."""
+    rng = np.random.default_rng(0)
+    cells = {"mountain_car": 100.0, "pendulum": 50.0}
+    noise = {env: rng.normal(size=10) for env in cells}
+
+    def columns(env, ahead):
+        last = cells[env] + noise[env] + ahead
+        names = ("env_steps", *reproduced.SUMMARISED)
+        return {name: np.stack([last - 1, last], axis=1) for name in names}
+
+    ahead = {"V": 100.0, "near": 0.0, "MEPOL": 0.0}
+    order = [(env, m) for env in ("mountain_car", "pendulum") for m in ("V", "near")]
+    order += [("pendulum", "MEPOL"), ("mountain_car", "MEPOL")]
+    found = reproduced.summarise([(env, m, columns(env, ahead[m])) for env, m in order])
+    for env, level in cells.items():
+        table = found["last_iteration"][env]["mixture_coverage"]
+        assert abs(table["near"]["interquartile_mean"] - level) < 1
+        assert abs(table["V"]["interquartile_mean"] - level - 100) < 1
+    everywhere = found["all_environments"]["mixture_coverage"]
+    assert {m: of["probability_of_improvement"] for m, of in everywhere.items()} == {
+        "near": 1.0,
+        "MEPOL": 1.0,
+    }
+
+
 def test_the_raw_values_are_those_of_the_runs(finished):
     out, _ = finished
     with open(out / "fig4" / "raw.csv") as file:
@@ -204,14 +319,15 @@ def test_the_summary_is_of_the_last_iteration(finished):
     out, _ = finished
     summary = json.loads((out / "fig4" / "summary.json").read_text())
     assert summary["compared_with"] == "V"
+    assert summary["versions"] == [runs.stack()] and summary["all_environments"] == {}
     for method in ("H", "LA", "V"):
         last = [
             runs.read_metrics(out / "fig4" / cell.name)[-1]["cumulative_coverage"]
             for cell in protocol.make("fig4", "toy", 1)
             if cell.method == method
         ]
-        found = summary["last_iteration"]["cumulative_coverage"][method]
-        assert found["values"] == [last]
+        found = summary["last_iteration"]["pendulum"]["cumulative_coverage"][method]
+        assert found["values"] == last
         assert found["interquartile_mean"] == last[0]
         assert ("probability_of_improvement" in found) == (method != "V")
     assert (out / "fig4" / "fig4.png").stat().st_size > 10_000
@@ -306,3 +422,9 @@ def test_the_weights_of_the_classic_environments_are_computed_once(tmp_path, mon
     assert 0 <= table["pendulum, fresh_entropy"]["η = 0.1"]["probability_of_improvement"] <= 1
     monkeypatch.setattr(classic_weights, "_run", None)
     assert classic_weights.results(tmp_path, "toy", 1) == found
+    for scale, seeds in (("cpu", 1), ("toy", 2)):  # what took minutes is not written over
+        with pytest.raises(cli.UsageError, match="choose another --out"):
+            classic_weights.results(tmp_path, scale, seeds)
+    (tmp_path / classic_weights.RESULTS).write_text("{")
+    with pytest.raises(cli.UsageError, match="cannot be read"):
+        classic_weights.results(tmp_path, "toy", 1)
