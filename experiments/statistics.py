@@ -30,11 +30,8 @@ def probability_of_improvement(ours: Scores, theirs: Scores) -> float:
     Raises:
       ValueError: different numbers of tasks.
     """
-    each = [
-        stats.mannwhitneyu(x, y).statistic / (len(x) * len(y))
-        for x, y in zip(ours, theirs, strict=True)
-    ]
-    return float(np.mean(each))
+    pairs = ((x[:, None], y[None]) for x, y in zip(ours, theirs, strict=True))
+    return float(np.mean([np.mean((x > y) + 0.5 * (x == y)) for x, y in pairs]))
 
 
 def interval(
