@@ -609,6 +609,8 @@ def test_kmeans_pays_from_where_the_centres_are_and_then_follows_each_state_in_t
         np.testing.assert_array_equal(state.counts, counts)
         np.testing.assert_allclose(metrics["bonus_center_distance"], np.mean(distances), rtol=1e-5)
     assert int(state.counts.sum()) == 2 * B
+    many = made("kmeans")[0].learn(state, steps_of(size=kmeans.MAX_FOLLOWED + 9), KEY)[0]
+    assert int(many.counts.sum()) == 2 * B + kmeans.MAX_FOLLOWED
 
 
 def test_a_centre_that_follows_few_is_chosen_over_one_that_lies_nearer():

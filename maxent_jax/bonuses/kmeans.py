@@ -21,6 +21,8 @@ from maxent_jax.types import Metrics
 
 # k, learning_rate, balancing_strength and power_fn_exponent of mujoco/train.yaml.
 NUM_CENTERS, STEP, BALANCE, EXPONENT = 300, 0.05, 1e-4, 0.5
+# States of a batch that are followed, one after the other: all in `quick` and `paper`.
+MAX_FOLLOWED = 128
 
 
 class State(NamedTuple):
@@ -55,8 +57,9 @@ def reward(setting: Setting, state: State, steps: Steps) -> tuple[State, jax.Arr
 
 
 def learn(setting: Setting, state: State, steps: Steps, key: jax.Array) -> tuple[State, Metrics]:
-    """The states of the batch one after the other, in a random order, each moving its centre."""
+    """States of the batch one after the other, in a random order, each moving its centre."""
     states = jax.random.permutation(key, protocol.scaled(setting, steps.next_observation))
+    states = states[:MAX_FOLLOWED]
 
     def follow(state: State, point: jax.Array):
         index = nearest_center(state, point[None])[0]
