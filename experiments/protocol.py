@@ -18,14 +18,13 @@ import filelock
 from experiments.cli import UsageError
 from maxent_jax import integrity, runs
 from maxent_jax.choices import BASELINES, CLASSIC_ENVS
-from maxent_jax.config import Config, preset
+from maxent_jax.config import DEFAULTS, Config, preset
+from maxent_jax.presets import PLAIN
 
 STUDY, LOCK = "study.json", "lock"
 VERSION = 1  # of a study's directory
 SCALES = ("toy", "cpu", "paper")
 ETAS = (0.1, 0.01, 0.001)
-
-DEFAULTS = {field.name: field.default for field in dataclasses.fields(Config)}
 
 Changes = dict[str, Any]
 
@@ -77,13 +76,6 @@ CLASSIC = {
 THREE: dict[str, Changes] = {name.upper(): {"method": name} for name in ("h", "la", "v")}
 # Ablations of what an iteration does, not of what the iterations add up to, end after two of them.
 ABLATION = ROBOT | {"cpu": Scale("quick", 3, ("ant",), {"num_iterations": 2})}
-# The learner that the baselines and the published methods have, whatever the preset.
-PLAIN: Changes = {
-    "shaping": 0.0,
-    "shaping_survives_death": False,
-    "return_steps": 1,
-    "reward_scale": 1.0,
-}
 # A method's own choice is left to the method: see `home`.
 REFRESHED: dict[str, Changes] = {
     "every 1": {"method": "la"},

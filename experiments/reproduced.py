@@ -68,13 +68,16 @@ def study(directory: Path, name: str, cells: Sequence[Cell]) -> None:
             rows += mepol_rows.rows(directory / config.env, config, config.num_seeds)
     raw.write(directory / "raw.csv", rows)
     groups = list(raw.groups(rows))
-    summary: dict[str, Any] = {"study": name, "what": _what(name)}
-    summary |= {"versions": _versions(directory, cells)}
-    summary |= summarise(groups)
+    summary: dict[str, Any] = {
+        "study": name,
+        "what": _what(name),
+        "versions": _versions(directory, cells),
+        **summarise(groups),
+    }
     runs.write_json(directory / "summary.json", summary)
     _save(paper_figures.curves(groups, _what(name)), directory, name)
     for env, table in summary["last_iteration"].items():
-        _print(summary["compared_with"], {f"{env}, {name}": table[name] for name in table})
+        _print(summary["compared_with"], {f"{env}, {measure}": table[measure] for measure in table})
     if len(summary["versions"]) > 1:
         print(f"note: the runs were made with {len(summary['versions'])} sets of versions.")
     print(f"{directory / 'raw.csv'}, {directory / 'summary.json'}")
@@ -106,7 +109,7 @@ def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[
         }
         for env in envs
     }
-    everywhere = {
+    everywhere = {  # where that says more than the one environment does
         name: statistics.improvements(
             {
                 method: [last[env][name][method] for env in envs]
@@ -115,7 +118,7 @@ def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[
             },
             ours,
         )
-        for name in SUMMARISED
+        for name in (SUMMARISED if len(envs) > 1 else ())
     }
     return {
         "compared_with": ours,
@@ -124,7 +127,7 @@ def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[
             env: {name: statistics.compare(by_method, ours) for name, by_method in of_env.items()}
             for env, of_env in last.items()
         },
-        "all_environments": everywhere if len(envs) > 1 else {},
+        "all_environments": everywhere,
     }
 
 

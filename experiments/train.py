@@ -20,7 +20,6 @@ from maxent_jax import runs
 from maxent_jax.config import Config, preset
 
 LOCK = "lock"  # held while a process trains; the system frees a dead one's
-# A preset is a name for values that are compared one by one.
 
 
 class BusyError(cli.UsageError):

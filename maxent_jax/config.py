@@ -171,7 +171,7 @@ class Config:
         Configs with equal programs share one compilation; the data enters the state in
         `algorithm.init`.
         """
-        defaults: dict[str, Any] = {name: _DEFAULTS[name] for name in DATA_FIELDS}
+        defaults: dict[str, Any] = {name: DEFAULTS[name] for name in DATA_FIELDS}
         if self.weights == CORRECTIVE:  # a computation, not a table
             del defaults["weights"]
         return dataclasses.replace(self, **defaults)
@@ -187,7 +187,7 @@ class Config:
         if self.episodic_weight == 0:
             named["episodic_weight"] = "no episodic term"
         for name in ("weights", "reference", "start", "refresh_period"):
-            if getattr(self, name) != _DEFAULTS[name]:
+            if getattr(self, name) != DEFAULTS[name]:
                 named[name] = "set apart from its method"
         return named
 
@@ -197,7 +197,7 @@ DATA_FIELDS = (
     *("weights", "eta", "reference", "refresh_period", "start"),
     *("plateau_segments", "plateau_tolerance"),
 )
-_DEFAULTS = {field.name: field.default for field in dataclasses.fields(Config)}
+DEFAULTS = {field.name: field.default for field in dataclasses.fields(Config)}
 
 
 def preset(name: str, **changes: Any) -> Config:

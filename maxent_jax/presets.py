@@ -100,10 +100,11 @@ IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
     },
 }
 
-# What methods as their authors published them, and the baselines, do whatever the preset.
-_AS_PUBLISHED: dict[str, Any] = dict(
-    shaping=0.0, shaping_survives_death=False, episodic_weight=0.0, return_steps=1, reward_scale=1.0
+# The learner of methods as their authors published them, and of the baselines, whatever the preset.
+PLAIN: dict[str, Any] = dict(
+    shaping=0.0, shaping_survives_death=False, return_steps=1, reward_scale=1.0
 )
+_AS_PUBLISHED: dict[str, Any] = PLAIN | dict(episodic_weight=0.0)
 OF_METHOD: dict[str, dict[str, Any]] = {
     "h-official": _AS_PUBLISHED | dict(bonus="histogram", mixing="step", leave_own_out=False),
     **{name: _AS_PUBLISHED | dict(bonus=name) for name in BASELINES},

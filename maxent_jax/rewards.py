@@ -129,8 +129,15 @@ def _floored_log_density(features, reference, num_neighbors, exclude):
     if exclude is not None:
         num_points = num_points - (exclude >= 0)
     distance = knn_distances(features, reference, num_neighbors, exclude)[:, -1]
+    return floored_log_density(distance, num_points, num_neighbors, reference.shape[1])
+
+
+def floored_log_density(
+    distance: jax.Array, num_points: jax.Array | int, num_neighbors: int, dims: int
+) -> jax.Array:
+    """density.entropy.log_density, bounded where the distance is 0."""
     distance = jnp.maximum(distance, DISTANCE_FLOOR)
-    return log_density(distance, num_points, num_neighbors, reference.shape[1])
+    return log_density(distance, num_points, num_neighbors, dims)
 
 
 def shaped(

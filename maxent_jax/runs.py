@@ -107,6 +107,7 @@ def check_config(directory: Path, config: Config) -> None:
       RunError: it has not, or there is none.
     """
     saved = read_config(directory)
+    # A preset is a name for values that are compared one by one.
     names = [field.name for field in dataclasses.fields(Config) if field.name != "preset"]
     values = ((name, getattr(saved, name), getattr(config, name)) for name in names)
     changed = [f"{name} was {old} and is {new}" for name, old, new in values if old != new]

@@ -19,9 +19,14 @@ def distances(points: jax.Array, rows: jax.Array, num_neighbors: int) -> jax.Arr
       ValueError: B <= k.
     """
     check(points.shape[0], num_neighbors)
-    found = knn_distances(points, points, num_neighbors, exclude=rows, labels=rows)
-    farthest = jnp.max(jnp.where(jnp.isfinite(found), found, 0.0), axis=-1, keepdims=True)
-    return jnp.where(jnp.isfinite(found), found, farthest)
+    return filled(knn_distances(points, points, num_neighbors, exclude=rows, labels=rows))
+
+
+def filled(nearest: jax.Array) -> jax.Array:
+    """[..., k] with the farthest in place of those that are missing, inf; 0 where all are."""
+    there = jnp.isfinite(nearest)
+    farthest = jnp.max(jnp.where(there, nearest, 0.0), axis=-1, keepdims=True)
+    return jnp.where(there, nearest, farthest)
 
 
 def check(batch_size: int, num_neighbors: int) -> None:

@@ -10,12 +10,10 @@ and one more neighbour; ours is the k-th. The paper's search for k is not in its
 import functools
 
 import jax
-import jax.numpy as jnp
 
 from maxent_jax import rewards
 from maxent_jax.bonuses import particles, protocol
 from maxent_jax.bonuses.protocol import Bonus, Setting, State, Steps
-from maxent_jax.density import entropy
 
 NUM_NEIGHBORS, ORDER = 5, 0.1  # k and alpha of src/rise.py
 
@@ -61,7 +59,6 @@ def renyi_reward(setting: Setting, state: State, steps: Steps) -> tuple[State, j
     """
     states = protocol.scaled(setting, steps.next_observation)
     nearest = particles.distances(states, steps.row, NUM_NEIGHBORS)[:, -1]
-    distance = jnp.maximum(nearest, rewards.DISTANCE_FLOOR)
-    num_others = states.shape[0] - 1
-    log_p = entropy.log_density(distance, num_others, NUM_NEIGHBORS, states.shape[1])
+    num_states, dims = states.shape
+    log_p = rewards.floored_log_density(nearest, num_states - 1, NUM_NEIGHBORS, dims)
     return state, (ORDER - 1) * log_p

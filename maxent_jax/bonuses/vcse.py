@@ -76,8 +76,7 @@ def joint_neighbors(
         value_apart = jnp.abs(values - value)
         other = rows != own
         joint = jnp.where(other, jnp.maximum(apart, value_apart), jnp.inf)
-        nearest = smallest_k(joint, num_neighbors)
-        distance = jnp.max(jnp.where(jnp.isfinite(nearest), nearest, 0.0))
+        distance = particles.filled(smallest_k(joint, num_neighbors))[-1]
         # ε is often itself a distance of values, of which XLA may make another in its last bit.
         nearer = value_apart < distance * (1 - ROUNDING)
         return distance, jnp.sum(other & nearer, dtype=jnp.int32)
