@@ -99,6 +99,41 @@ def curves(groups: Sequence[tuple[str, str, Columns]], title: str) -> Figure:
     return figure
 
 
+def along(
+    groups: Sequence[tuple[str, str, Columns]],
+    places: Mapping[tuple[str, str], float],
+    label: str,
+    title: str,
+) -> Figure:
+    """The last iteration against the number that the methods differ in; a row for each env.
+
+    Interquartile means with their intervals, and every seed's value.
+    Args:
+      places: by env and method; of others, as the random policy, there is a line.
+    """
+    envs = list(dict.fromkeys(env for env, _, _ in groups))
+    figure = Figure(figsize=(13, 3.4 * len(envs)), layout="constrained")
+    axes = figure.subplots(len(envs), len(QUANTITIES), squeeze=False)
+    for env, row in zip(envs, axes, strict=True):
+        own = [(method, columns) for at, method, columns in groups if at == env]
+        placed = sorted((places[env, m], c) for m, c in own if (env, m) in places)
+        for ax, (name, quantity) in zip(row, QUANTITIES, strict=True):
+            x = [place for place, _ in placed]
+            last = np.stack([columns[name][:, -1] for _, columns in placed], axis=1)
+            _band(ax, last, "", COLORS["V"], x)
+            ax.plot(x, last.T, ".", ms=4, color=COLORS["V"], alpha=0.5)
+            for method, columns in own:
+                if (env, method) not in places and name in columns:
+                    ax.axhline(columns[name][:, -1].mean(), ls=":", lw=1, color=COLORS[RANDOM])
+            smallest = min(place for place in x if place > 0)
+            ax.set_xscale("symlog", linthresh=smallest, linscale=0.4)
+            ax.set(title=quantity, xlabel=label)
+            ax.grid(alpha=0.25)
+    seeds = max(len(columns["env_steps"]) for _, _, columns in groups)
+    figure.suptitle(f"{title}: interquartile mean of {seeds} seeds, 95 % bootstrap interval")
+    return figure
+
+
 def occupancies(directories: Mapping[str, Path]) -> Figure:
     """Fig. 5: a row for each method; log-occupancy in training and of the mixture, and paths."""
     figure = Figure(figsize=(13, 4 * len(directories)), layout="constrained")
@@ -127,11 +162,13 @@ def _draw(row: Sequence[Axes], columns: Columns, name: str, opacity: float, **st
         ax.fill_between(x, low, high, color=style["color"], alpha=opacity, lw=0)
 
 
-def _band(ax: Axes, values: np.ndarray, label: str, color: str) -> None:
+def _band(
+    ax: Axes, values: np.ndarray, label: str, color: str, x: Sequence[float] | None = None
+) -> None:
     middle, low, high = interval_of_curves(values)
-    rounds = np.arange(1, len(middle) + 1)
-    ax.plot(rounds, middle, color=color, label=label)
-    ax.fill_between(rounds, low, high, color=color, alpha=0.2, lw=0)
+    x = range(1, len(middle) + 1) if x is None else x
+    ax.plot(x, middle, color=color, label=label)
+    ax.fill_between(x, low, high, color=color, alpha=0.2, lw=0)
 
 
 def _styles(methods: Sequence[str]) -> dict[str, dict[str, Any]]:

@@ -60,6 +60,7 @@ class Study(NamedTuple):
     scales: dict[str, Scale]
     together: bool = False  # seeds side by side in one run, not each in its own
     mepol: bool = False  # beside them, at the same env steps
+    along: str = ""  # the number that the methods differ in: see reproduced.ALONG
 
 
 TOY = Scale("smoke", 2, ("pendulum",))
@@ -68,9 +69,9 @@ ROBOT = {
     "cpu": Scale("quick", 3, ("ant",)),
     "paper": Scale("paper", 5, ("ant",)),
 }
-CLASSIC = {
+CLASSIC = {  # on two cores an iteration of ten seeds takes minutes: two of them, in one environment
     "toy": TOY,
-    "cpu": Scale("quick", 10, CLASSIC_ENVS),
+    "cpu": Scale("quick", 10, ("pendulum",), {"num_iterations": 2}),
     "paper": Scale("paper", 10, CLASSIC_ENVS),
 }
 THREE: dict[str, Changes] = {name.upper(): {"method": name} for name in ("h", "la", "v")}
@@ -100,9 +101,15 @@ STUDIES: dict[str, Study] = {
         },
         ROBOT,
     ),
-    "refresh": Study("steps between refreshes of LA's reward", REFRESHED, ROBOT),
+    "refresh": Study(
+        "steps between refreshes of LA's reward", REFRESHED, ROBOT, along="refresh_period"
+    ),
     "refresh_classic": Study(
-        "steps between refreshes of LA's reward", REFRESHED, CLASSIC, together=True
+        "steps between refreshes of LA's reward",
+        REFRESHED,
+        CLASSIC,
+        together=True,
+        along="refresh_period",
     ),
     "start": Study(
         "the agent that V's iterations start from",
@@ -113,6 +120,7 @@ STUDIES: dict[str, Study] = {
         "weight of the episodic term",
         {f"λ = {weight}": {"episodic_weight": weight} for weight in (0.0, 0.01, 0.1, 1.0)},
         ABLATION,
+        along="episodic_weight",
     ),
     "form": Study(
         "form of the reward",
@@ -145,7 +153,7 @@ STUDIES: dict[str, Study] = {
     "baselines": Study(
         "rewards that the field compares with, one policy each, and V",
         {"V": {"method": "v"} | PLAIN, **{name: {"method": name} for name in BASELINES}},
-        CLASSIC | {"cpu": Scale("quick", 10, ("pendulum",), {"num_iterations": 2})},
+        CLASSIC,
         together=True,
         mepol=True,
     ),

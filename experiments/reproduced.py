@@ -1,6 +1,6 @@
 """From finished studies to figures, tables and summaries."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +9,25 @@ from matplotlib.figure import Figure
 
 from experiments import classic_weights, mepol_rows, paper_figures, protocol, raw, statistics
 from experiments.protocol import Cell
-from maxent_jax import mixture, plotting, runs
+from maxent_jax import methods, mixture, plotting, runs
+from maxent_jax.config import Config
 
 FIG2_TIMES = (5, 10, 20)
 SUMMARISED = (
     *("cumulative_coverage", "cumulative_entropy"),
     *("mixture_coverage", "mixture_entropy", "mixture_knn_entropy"),
 )
+
+# What a study's methods may differ in as a number: its name in the figure, and its value.
+ALONG: dict[str, tuple[str, Callable[[Config], float]]] = {
+    "refresh_period": (
+        "env steps between refreshes; the last, an iteration",
+        lambda config: (
+            methods.row(config).refresh_period * config.num_envs or config.steps_per_iteration
+        ),
+    ),
+    "episodic_weight": ("λ", lambda config: config.episodic_weight),
+}
 
 
 def draw(
@@ -76,6 +88,10 @@ def study(directory: Path, name: str, cells: Sequence[Cell]) -> None:
     }
     runs.write_json(directory / "summary.json", summary)
     _save(paper_figures.curves(groups, _what(name)), directory, name)
+    if field := protocol.STUDIES[name].along:
+        label, value = ALONG[field]
+        places = {(cell.config.env, cell.method): value(cell.config) for cell in cells}
+        _save(paper_figures.along(groups, places, label, _what(name)), directory, f"{name}_along")
     for env, table in summary["last_iteration"].items():
         _print(summary["compared_with"], {f"{env}, {measure}": table[measure] for measure in table})
     if len(summary["versions"]) > 1:

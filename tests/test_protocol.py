@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from experiments import cli, driver, protocol, raw, reproduce, reproduced
+from experiments import cli, driver, paper_figures, protocol, raw, reproduce, reproduced
 from experiments.protocol import Cell
 from maxent_jax import runs
 from maxent_jax.choices import ConfigError
@@ -292,6 +292,28 @@ def test_environments_are_summarised_apart_and_never_confused():
         "near": 1.0,
         "MEPOL": 1.0,
     }
+
+
+def test_what_methods_differ_in_as_a_number_is_an_axis():
+    """Each study's numbers, and what is drawn over them: mean, interval and every seed."""
+    found = {}
+    for name, study in protocol.STUDIES.items():
+        if study.along:
+            cells = protocol.make(name, "cpu", 1)
+            found[name] = {c.method: reproduced.ALONG[study.along][1](c.config) for c in cells}
+    iteration = protocol.make("refresh", "cpu", 1)[0].config.steps_per_iteration
+    assert list(found) == ["refresh", "refresh_classic", "episodic"]
+    assert list(found["refresh"].values()) == [64, 640, 6400, iteration]
+    assert list(found["episodic"].values()) == [0, 0.01, 0.1, 1]
+
+    values = {"a": np.array([[0.0, 4.0], [0.0, 8.0]]), "b": np.array([[9.0, 1.0], [9.0, 3.0]])}
+    names = ("env_steps", *(name for name, _ in paper_figures.QUANTITIES))
+    groups = [("ant", m, dict.fromkeys(names, column)) for m, column in values.items()]
+    figure = paper_figures.along(groups, {("ant", "a"): 10.0, ("ant", "b"): 0.0}, "λ", "title")
+    for ax in figure.axes:
+        middle, *seeds = (np.asarray(line.get_xydata()).tolist() for line in ax.get_lines())
+        assert middle == [[0, 2], [10, 6]]
+        assert seeds == [[[0, 1], [10, 4]], [[0, 3], [10, 8]]]
 
 
 def test_the_raw_values_are_those_of_the_runs(finished):
