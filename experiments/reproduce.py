@@ -101,6 +101,8 @@ def _check(arguments: Arguments) -> tuple[int, int]:
     shard = re.fullmatch(r"([0-9]+)/([0-9]+)", arguments.shard)
     if shard is None or int(shard[1]) >= int(shard[2]):
         raise cli.UsageError(f"shard is {arguments.shard}, but must be I/N with 0 <= I < N.")
+    if FIGURES.get(arguments.what) == () and not arguments.figures:
+        raise cli.UsageError(f"{arguments.what} has no cells: without figures nothing is left.")
     if arguments.out.is_file():
         raise cli.UsageError(f"out {arguments.out} is a file: name a folder.")
     return int(shard[1]), int(shard[2])

@@ -16,33 +16,40 @@ CONFIDENCE = 0.95
 EXACT: Final = "inverted_cdf"  # percentiles are values that were found: none lies beside -inf
 
 
-def interquartile_mean(scores: Scores) -> float:
+def interquartile_mean(scores: Scores) -> np.ndarray:
     """The mean of the middle half of all runs of all tasks, which have one unit.
 
-    From four runs on no single one can move it far; of three it is their mean.
+    It is taken over the last axis. From four runs on no single one can move it far; of three it is
+    their mean.
     """
-    return float(stats.trim_mean(np.concatenate(scores), 0.25))
+    return stats.trim_mean(np.concatenate(scores, axis=-1), 0.25, axis=-1)
 
 
-def probability_of_improvement(ours: Scores, theirs: Scores) -> float:
+def probability_of_improvement(ours: Scores, theirs: Scores) -> np.ndarray:
     """How likely a run of ours is to beat one of theirs on the same task, ties counted half.
+
+    The runs lie along the last axis.
 
     Raises:
       ValueError: different numbers of tasks.
     """
-    pairs = ((x[:, None], y[None]) for x, y in zip(ours, theirs, strict=True))
-    return float(np.mean([np.mean((x > y) + 0.5 * (x == y)) for x, y in pairs]))
+    pairs = ((x[..., :, None], y[..., None, :]) for x, y in zip(ours, theirs, strict=True))
+    of_tasks = [np.mean((x > y) + 0.5 * (x == y), axis=(-2, -1)) for x, y in pairs]
+    return np.mean(of_tasks, axis=0)
 
 
 def interval(
-    statistic: Callable[..., float], *scores: Scores, seed: int = 0, resamples: int = RESAMPLES
+    statistic: Callable[..., np.ndarray],
+    *scores: Scores,
+    seed: int = 0,
+    resamples: int = RESAMPLES,
 ) -> tuple[float, float]:
     """The 95 % percentile interval of a statistic by stratified bootstrap.
 
     The seeds of each task, of each of the scores, are drawn anew with replacement; tasks stay.
 
     Args:
-      statistic: of as many scores as are given.
+      statistic: of as many scores as are given, over the last axis of arrays [resamples, seeds].
       scores: not empty. With one seed a task the interval is a point, and says nothing; with
         three it holds the mean of normal values three times in four.
     Raises:
@@ -51,12 +58,10 @@ def interval(
     if any(len(of_task) == 0 for some in scores for of_task in some):
         raise ValueError("each task needs at least one seed")
     random = np.random.default_rng(seed)
-    found = [
-        statistic(*([random.choice(x, len(x)) for x in some] for some in scores))
-        for _ in range(resamples)
-    ]
-    outside = 50 * (1 - CONFIDENCE)
-    low, high = np.percentile(found, [outside, 100 - outside], method=EXACT)
+    found = statistic(
+        *([x[random.integers(len(x), size=(resamples, len(x)))] for x in some] for some in scores)
+    )
+    low, high = _percentiles(found)
     return float(low), float(high)
 
 
@@ -68,9 +73,7 @@ def interval_of_curves(curves: np.ndarray, seed: int = 0) -> tuple[np.ndarray, .
     random = np.random.default_rng(seed)
     rows = random.integers(len(curves), size=(RESAMPLES, len(curves)))
     found = stats.trim_mean(curves[rows], 0.25, axis=1)  # [resamples, T]
-    outside = 50 * (1 - CONFIDENCE)
-    low, high = np.percentile(found, [outside, 100 - outside], axis=0, method=EXACT)
-    return stats.trim_mean(curves, 0.25, axis=0), low, high
+    return stats.trim_mean(curves, 0.25, axis=0), *_percentiles(found)
 
 
 def compare(scores: Mapping[str, np.ndarray], ours: str) -> dict[str, dict[str, Any]]:
@@ -79,7 +82,7 @@ def compare(scores: Mapping[str, np.ndarray], ours: str) -> dict[str, dict[str, 
     """
     found = {
         name: {
-            "interquartile_mean": interquartile_mean([own]),
+            "interquartile_mean": float(interquartile_mean([own])),
             "interval": interval(interquartile_mean, [own]),
             "values": own,
         }
@@ -93,9 +96,15 @@ def improvements(scores: Mapping[str, Scores], ours: str) -> dict[str, dict[str,
     """By each other name: how likely `ours` is to be better, on all tasks, with its interval."""
     return {
         name: {
-            "probability_of_improvement": probability_of_improvement(scores[ours], theirs),
+            "probability_of_improvement": float(probability_of_improvement(scores[ours], theirs)),
             "probability_interval": interval(probability_of_improvement, scores[ours], theirs),
         }
         for name, theirs in scores.items()
         if name != ours
     }
+
+
+def _percentiles(found: np.ndarray) -> np.ndarray:
+    """The two ends of what resamples [N, ...] found."""
+    outside = 50 * (1 - CONFIDENCE)
+    return np.percentile(found, [outside, 100 - outside], axis=0, method=EXACT)

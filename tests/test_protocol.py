@@ -86,6 +86,7 @@ def test_fewer_seeds_are_a_part_of_the_study():
         (["fig9"], "did you mean 'fig"),
         (["stael"], "did you mean 'stale'"),
         (["fig4", "--scale", "cpus"], "did you mean 'cpu'"),
+        (["fig3", "--no-figures"], "has no cells"),
         (["fig4", "--seeds", "0"], "at least 1"),
         (["fig4", "--jobs", "0"], "at least 1"),
         (["fig4", "--shard", "2/2"], "0 <= I < N"),

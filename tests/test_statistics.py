@@ -27,7 +27,10 @@ def test_nine_in_ten_intervals_hold_the_mean_that_the_seeds_were_drawn_around():
     held = 0
     for trial in range(200):
         low, high = statistics.interval(
-            lambda x: float(np.mean(x[0])), [random.normal(3.0, 1.0, 20)], seed=trial, resamples=300
+            lambda x: np.mean(x[0], axis=-1),
+            [random.normal(3.0, 1.0, 20)],
+            seed=trial,
+            resamples=300,
         )
         held += low <= 3.0 <= high
     # Derived: the percentile bootstrap of 20 normal seeds covers 0.93; four standard errors.
@@ -36,7 +39,7 @@ def test_nine_in_ten_intervals_hold_the_mean_that_the_seeds_were_drawn_around():
 
 def test_seeds_are_drawn_within_their_task():
     tasks = [np.zeros(5), np.full(5, 10.0)]
-    assert statistics.interval(lambda x: float(np.mean(np.concatenate(x))), tasks) == (5.0, 5.0)
+    assert statistics.interval(lambda x: np.mean(np.concatenate(x, -1), -1), tasks) == (5.0, 5.0)
     with pytest.raises(ValueError, match="at least one seed"):
         statistics.interval(statistics.interquartile_mean, [np.zeros(0)])
 
