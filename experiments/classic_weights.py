@@ -10,6 +10,7 @@ import numpy as np
 
 from experiments import protocol, statistics
 from experiments.cli import UsageError
+from experiments.raw import RANDOM
 from maxent_jax import mixture, official, runs
 
 SEEDS = {"toy": 2, "cpu": 10, "paper": 10}
@@ -21,6 +22,11 @@ KEPT = (
     *("running_entropy", "random_running_entropy", "density_entropy", "random_from_start_entropy"),
     *("fresh_entropy", "random_fresh_entropy", "coverage"),
 )
+RANDOM_BESIDE = {  # what the random policy reaches, by what the mixture does
+    "running_entropy": "random_running_entropy",
+    "density_entropy": "random_from_start_entropy",
+    "fresh_entropy": "random_fresh_entropy",
+}
 RESULTS = "classic.json"
 
 Results = dict[str, dict[str, Any]]
@@ -32,25 +38,44 @@ def results(directory: Path, scale: str, num_seeds: int | None) -> Results:
     All weightings and seeds of an environment are one program.
 
     Raises:
-      UsageError: the directory holds it at another scale, or with other seeds or settings.
+      UsageError: see `held`.
+    """
+    before = held(directory, scale, num_seeds)
+    if before is not None:
+        return before
+    asked, settings = _asked(scale, num_seeds)
+    found = {env: _run(settings[env], asked["seeds"]) for env in settings}
+    content = asked | {"versions": runs.stack(), "results": found}
+    runs.write_json(directory / RESULTS, content)
+    return runs.jsonable(found)
+
+
+def held(directory: Path, scale: str, num_seeds: int | None) -> Results | None:
+    """What the directory's file holds already, if there is one.
+
+    Raises:
+      UsageError: it was made at another scale, or with other seeds or settings.
     """
     path = directory / RESULTS
-    seeds = num_seeds or SEEDS[scale]
-    asked = {"scale": scale, "seeds": seeds}
-    settings = {env: _settings(env, scale) for env in official.SETTINGS}
-    if path.exists():
-        held = _read(path)
-        used = {env: of_env.get("settings") for env, of_env in held.get("results", {}).items()}
-        wanted = runs.jsonable({env: s._asdict() for env, s in settings.items()})
-        if {name: held.get(name) for name in asked} | used != asked | wanted:
-            raise UsageError(
-                f"{path} was made at another scale, or with other seeds or settings: choose "
-                f"another --out."
-            )
-        return held["results"]
-    found = {env: _run(settings[env], seeds) for env in settings}
-    runs.write_json(path, asked | {"versions": runs.stack(), "results": found})
-    return runs.jsonable(found)
+    if not path.exists():
+        return None
+    content = _read(path)
+    asked, settings = _asked(scale, num_seeds)
+    used = {env: of_env.get("settings") for env, of_env in content.get("results", {}).items()}
+    wanted = runs.jsonable({env: s._asdict() for env, s in settings.items()})
+    if {name: content.get(name) for name in asked} | used != asked | wanted:
+        raise UsageError(
+            f"{path} was made at another scale, or with other seeds or settings: choose another "
+            f"--out."
+        )
+    return content["results"]
+
+
+def _asked(scale: str, num_seeds: int | None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Scale and seeds, and the settings by environment."""
+    changes = TOY if scale == "toy" else {}
+    settings = {env: s._replace(**changes) for env, s in official.SETTINGS.items()}
+    return {"scale": scale, "seeds": num_seeds or SEEDS[scale]}, settings
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -60,23 +85,29 @@ def _read(path: Path) -> dict[str, Any]:
         raise UsageError(f"{path} cannot be read: choose another --out.") from None
 
 
-def _settings(env: str, scale: str) -> official.Settings:
-    return official.SETTINGS[env]._replace(**(TOY if scale == "toy" else {}))
+def curves(found: Results) -> dict[str, dict[str, dict[str, np.ndarray]]]:
+    """By environment, measure and weighting, with the random policy: [seeds, rounds].
+
+    The random policy stands once for each seed: it plays beside every weighting, the same episodes
+    but where they start in states of the mixture, so that it is the mean of those.
+    """
+    return {
+        env: {
+            name: {weighting: np.array(of[name]) for weighting, of in weightings.items()}
+            | {RANDOM: np.mean([of[random] for of in weightings.values()], axis=0)}
+            for name, random in RANDOM_BESIDE.items()
+        }
+        for env, weightings in ((env, of_env["weightings"]) for env, of_env in found.items())
+    }
 
 
 def table(found: Results) -> Mapping[str, Any]:
-    """By environment and measure: the last round of each weighting, and uniform weights against
-    it.
-    """
-    summary: dict[str, Any] = {}
-    for env, of_env in found.items():
-        for name in ("fresh_entropy", "density_entropy", "running_entropy"):
-            last = {
-                weighting: np.array(values[name])[:, -1]
-                for weighting, values in of_env["weightings"].items()
-            }
-            summary[f"{env}, {name}"] = statistics.compare(last, "uniform")
-    return summary
+    """By environment and measure: the last round, and uniform weights against all else."""
+    return {
+        f"{env}, {name}": statistics.compare({who: x[:, -1] for who, x in of.items()}, "uniform")
+        for env, measures in curves(found).items()
+        for name, of in measures.items()
+    }
 
 
 def _run(settings: official.Settings, num_seeds: int) -> dict[str, Any]:

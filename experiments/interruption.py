@@ -21,7 +21,10 @@ class Interrupted(Exception):
         """By the signal of that number; saved in that directory."""
         self.exit_code = 128 + received
         name = signal.Signals(received).name
-        super().__init__(f"stopped by {name} and saved in {directory}: --resume goes on.")
+        super().__init__(
+            f"stopped by {name} and saved in {directory}: --resume goes on; "
+            f"a study's command does so by itself."
+        )
 
 
 class Interruption:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from experiments.raw import RANDOM
-from experiments.statistics import interval_of_curves
+from experiments.statistics import interquartile_mean, interval_of_curves
 from maxent_jax import plotting
 from maxent_jax.analysis import load_run, paths
 from maxent_jax.density import histogram
@@ -45,32 +45,29 @@ def weights(by_time: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
     return figure
 
 
-def classic_weights(found: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Fig. 3: what the official code plots; its runs beside the random policy from their starts;
-    and fresh runs from rest.
+def classic_weights(found: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]) -> Figure:
+    """Fig. 3, from `experiments.classic_weights.curves`: what the official code plots; its runs
+    beside the random policy from their starts; and fresh runs from rest.
     """
-    panels = (
-        ("running_entropy", "random_running_entropy", "as published: running mean"),
-        ("density_entropy", "random_from_start_entropy", "the mixture's ten runs, one start"),
-        ("fresh_entropy", "random_fresh_entropy", "a hundred runs from rest"),
-    )
+    titles = {
+        "running_entropy": "as published: running mean",
+        "density_entropy": "the mixture's ten runs, one start",
+        "fresh_entropy": "a hundred runs from rest",
+    }
+    colors = ("#d1495b", "#1b6ca8", "#5fa8d3", "#9a7aa0", COLORS[RANDOM])
     figure = Figure(figsize=(13, 3.4 * len(found)), layout="constrained")
-    axes = figure.subplots(len(found), len(panels), squeeze=False, sharey="row")
-    for row, (env, of_env) in zip(axes, found.items(), strict=True):
-        weightings = of_env["weightings"]
-        for ax, (name, random_name, title) in zip(row, panels, strict=True):
-            for color, (weighting, values) in zip(
-                ("#d1495b", "#1b6ca8", "#5fa8d3", "#9a7aa0"), weightings.items(), strict=True
-            ):
-                _band(ax, np.array(values[name]), weighting, color)
-            random = np.concatenate([values[random_name] for values in weightings.values()])
-            _band(ax, random, RANDOM, COLORS[RANDOM])
+    axes = figure.subplots(len(found), len(titles), squeeze=False, sharey="row")
+    for row, (env, measures) in zip(axes, found.items(), strict=True):
+        for ax, (name, title) in zip(row, titles.items(), strict=True):
+            for color, (who, values) in zip(colors, measures[name].items(), strict=True):
+                _band(ax, values, who, color)
             ax.set(xlabel="round", title=f"{env}: {title}")
             ax.grid(alpha=0.25)
         row[0].set_ylabel("entropy (nats)")
     axes[0, 0].legend(frameon=False, fontsize=8)
-    seeds = len(next(iter(weightings.values()))["fresh_entropy"])
-    figure.suptitle(f"MaxEnt-H as published: interquartile mean of {seeds} seeds, 95 % interval")
+    figure.suptitle(
+        f"MaxEnt-H as published: interquartile mean of {len(values)} seeds, 95 % interval"
+    )
     return figure
 
 
@@ -116,7 +113,8 @@ def along(
     axes = figure.subplots(len(envs), len(QUANTITIES), squeeze=False)
     for env, row in zip(envs, axes, strict=True):
         own = [(method, columns) for at, method, columns in groups if at == env]
-        placed = sorted((places[env, m], c) for m, c in own if (env, m) in places)
+        placed = [(places[env, m], c) for m, c in own if (env, m) in places]
+        placed.sort(key=lambda pair: pair[0])
         for ax, (name, quantity) in zip(row, QUANTITIES, strict=True):
             x = [place for place, _ in placed]
             last = np.stack([columns[name][:, -1] for _, columns in placed], axis=1)
@@ -124,7 +122,9 @@ def along(
             ax.plot(x, last.T, ".", ms=4, color=COLORS["V"], alpha=0.5)
             for method, columns in own:
                 if (env, method) not in places and name in columns:
-                    ax.axhline(columns[name][:, -1].mean(), ls=":", lw=1, color=COLORS[RANDOM])
+                    middle = float(interquartile_mean([columns[name][:, -1]]))
+                    ax.axhline(middle, ls=":", color=COLORS[RANDOM], label=method)
+                    ax.legend(frameon=False, fontsize=8)
             smallest = min(place for place in x if place > 0)
             ax.set_xscale("symlog", linthresh=smallest, linscale=0.4)
             ax.set(title=quantity, xlabel=label)

@@ -211,8 +211,10 @@ def holding(directory: Path) -> Iterator[None]:
         lock.acquire()
     except OSError as error:
         raise UsageError(f"cannot write to {directory}: {error.strerror}.") from None
-    with lock:
+    try:
         yield
+    finally:
+        lock.release()
 
 
 def _claim(directory: Path, content: Changes) -> None:
@@ -228,7 +230,7 @@ def _claim(directory: Path, content: Changes) -> None:
         content["cells"] = held["cells"] | content["cells"]
         if content == held:
             return
-    elif any(other.name != LOCK for other in directory.iterdir()):
+    elif any(o.name not in (LOCK, runs.temporary_of(path).name) for o in directory.iterdir()):
         raise UsageError(f"{directory} is no study's, and not empty: choose another --out.")
     runs.write_json(path, content)
 

@@ -61,6 +61,10 @@ def main(argv: Sequence[str]) -> None:
     whats = tuple(FIGURES) if arguments.what == "all" else (arguments.what,)
     names = dict.fromkeys(name for what in whats for name in FIGURES.get(what, (what,)))
     studies = {name: protocol.make(name, arguments.scale, arguments.seeds) for name in names}
+    if "fig3" in whats:
+        from experiments import classic_weights  # loads jax
+
+        classic_weights.held(arguments.out / "fig3", arguments.scale, arguments.seeds)
     for name, cells in studies.items():
         protocol.claim(arguments.out / name, name, arguments.scale, cells)
     for what in whats:
@@ -101,8 +105,10 @@ def _check(arguments: Arguments) -> tuple[int, int]:
     shard = re.fullmatch(r"([0-9]+)/([0-9]+)", arguments.shard)
     if shard is None or int(shard[1]) >= int(shard[2]):
         raise cli.UsageError(f"shard is {arguments.shard}, but must be I/N with 0 <= I < N.")
-    if FIGURES.get(arguments.what) == () and not arguments.figures:
-        raise cli.UsageError(f"{arguments.what} has no cells: without figures nothing is left.")
+    if FIGURES.get(arguments.what) == () and (not arguments.figures or int(shard[2]) > 1):
+        raise cli.UsageError(
+            f"{arguments.what} has no cells to share: leave out --shard and --no-figures."
+        )
     if arguments.out.is_file():
         raise cli.UsageError(f"out {arguments.out} is a file: name a folder.")
     return int(shard[1]), int(shard[2])
@@ -122,7 +128,7 @@ def _train(directory: Path, cells: Sequence[Cell]) -> int:
             with train.claimed(train.Arguments(cell.config, out=at, resume=True)):
                 from experiments import driver  # loads jax
 
-                driver.train(cell.config, at, started)
+                driver.train(cell.config, at, started, driver.Options(fallback=True))
         except train.BusyError:
             continue
         except (runs.RunError, runs.NonFiniteError) as error:

@@ -39,14 +39,15 @@ def draw(
 ) -> None:
     """Figures and studies by name, into directories of theirs; prints each file and table."""
     for what in whats:
-        if what == "fig2":
-            fig2(out / "fig2")
-        elif what == "fig3":
-            fig3(out / "fig3", scale, num_seeds)
-        elif what == "fig5":
-            fig5(out / "fig5", out / "fig4", studies["fig4"])
-        else:
-            study(out / what, what, studies[what])
+        with protocol.holding(out / what):  # of processes that share it, one at a time
+            if what == "fig2":
+                fig2(out / "fig2")
+            elif what == "fig3":
+                fig3(out / "fig3", scale, num_seeds)
+            elif what == "fig5":
+                fig5(out / "fig5", out / "fig4", studies["fig4"])
+            else:
+                study(out / what, what, studies[what])
 
 
 def fig2(directory: Path) -> None:
@@ -66,7 +67,7 @@ def fig3(directory: Path, scale: str, num_seeds: int | None) -> None:
     found = classic_weights.results(directory, scale, num_seeds)
     table = classic_weights.table(found)
     runs.write_json(directory / "summary.json", dict(table))
-    _save(paper_figures.classic_weights(found), directory, "fig3")
+    _save(paper_figures.classic_weights(classic_weights.curves(found)), directory, "fig3")
     _print("uniform", table)
     print(f"{directory / classic_weights.RESULTS}, {directory / 'summary.json'}")
 

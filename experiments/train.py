@@ -108,11 +108,13 @@ def claimed(arguments: Arguments) -> Iterator[None]:
         raise BusyError(f"another process is training in {directory}.") from None
     except OSError as error:
         raise cli.UsageError(f"cannot write to {directory}: {error.strerror}.") from None
-    with lock:
+    try:
         check_free(arguments)  # again: another process may have been here meanwhile
         if arguments.overwrite:
             _remove_run(directory)
         yield
+    finally:
+        lock.release()
 
 
 def check_free(arguments: Arguments) -> None:

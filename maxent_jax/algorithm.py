@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from maxent_jax import experience, methods, mixture, occupancy, parts, training
+from maxent_jax.choices import CORRECTIVE
 from maxent_jax.config import Config
 from maxent_jax.density import histogram, reservoir
 from maxent_jax.envs import base
@@ -105,13 +106,15 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
     )
     metrics = {
         "weights": weights,
-        "effective_policies": jnp.exp(-jnp.sum(weights * jnp.log(jnp.maximum(weights, 1e-30)))),
-        "best_policy": best,
-        "policy_return": scores.episode_return,
-        "policy_step_reward": scores.step_reward,
         "num_rollout_steps": jnp.sum(visited.alive, dtype=jnp.int32),
         "num_rollout_invalid": visited.num_invalid,
     }
+    if p.config.mixing == "episode":  # else no state is a policy's
+        metrics |= {
+            "best_policy": best,
+            "policy_return": scores.episode_return,
+            "policy_step_reward": scores.step_reward,
+        }
     return state._replace(key=key, learner=learner), metrics
 
 
@@ -135,23 +138,23 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
     archive = mixture.append(state.archive, learner.agent.parameters)
     weights = state.method.weights[archive.size - 1]
     key_starts, key_rollout, key_rows = jax.random.split(jax.random.key(EVALUATION_SEED), 3)
-    starts = base.draw_starts(learner.episodes.starts, config.mixture_episodes, key_starts)
-    visited = occupancy.of_mixture(
-        p,
-        archive,
-        weights,
-        starts,
-        key_rollout,
-        only_weighted=True,
-        deterministic=p.config.deterministic,
-    )
-    visited, weights = occupancy.corrected(p, visited, weights)
+
+    def roll_out(weights, key_starts, key_rollout):
+        starts = base.draw_starts(learner.episodes.starts, config.mixture_episodes, key_starts)
+        deterministic = p.config.deterministic
+        return occupancy.of_mixture(p, archive, weights, starts, key_rollout, True, deterministic)
+
+    if p.config.weights == CORRECTIVE:  # fitted to other episodes than those that are measured
+        fitted_to = roll_out(weights, *jax.random.split(jax.random.key(EVALUATION_SEED + 1)))
+        _, weights = occupancy.corrected(p, fitted_to, weights)
+    visited = roll_out(weights, key_starts, key_rollout)
     state = state._replace(iteration=state.iteration + 1, archive=archive)
     metrics = {
         "iteration": state.iteration,
         "env_steps": learner.env_steps,
         "gradient_steps": learner.gradient_steps,
         "mixture_weights": weights,
+        "effective_policies": jnp.exp(-jnp.sum(weights * jnp.log(jnp.maximum(weights, 1e-30)))),
         **coverage("cumulative", learner.visits),
         **(coverage("random", learner.random_visits) if config.random_baseline else {}),
         **occupancy.measures(p, visited, key_rows),

@@ -14,6 +14,7 @@ TORSO_ENVS = ("ant", "humanoid")  # a floating torso has a heading, and can be u
 TURNING_ENVS = ("ant",)  # whose observation we know how to turn about the vertical
 BONUSES = ("rnd", "icm", "ngu", "re3", "rise", "renyi", "vcse", "kmeans", "apt", "histogram")
 BASELINES = BONUSES[:-1]  # methods that one policy learns, paid by the bonus of that name
+NEIGHBORS = {"re3": 3, "rise": 5, "renyi": 5, "vcse": 12, "apt": 12}  # k, within a batch
 METHODS = ("h", "la", "v", "h-official", *BASELINES)
 BACKENDS = ("auto", "mjx", "mujoco", "warp")
 PHYSICS = ("reference", "fast")

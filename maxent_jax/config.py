@@ -290,6 +290,10 @@ def _check_together(c: Config) -> None:
             "corrective weights need mixing episode.",
         ),
         (
+            c.mixing == "step" and c.start == "best",
+            "mixing is step, where no state belongs to a policy: none is the best to start from.",
+        ),
+        (
             c.pooled and c.weights == CORRECTIVE,
             "pooled draws policies by their weights, which fully corrective ones only get later.",
         ),
@@ -339,6 +343,11 @@ def _check_together(c: Config) -> None:
         (
             c.batch_size > c.replay_size,
             f"batch-size is {c.batch_size}, but must not exceed replay-size = {c.replay_size}.",
+        ),
+        (
+            updates * c.batch_size <= choices.NEIGHBORS.get(c.bonus, 0),
+            f"batch-size is {c.batch_size}, but bonus {c.bonus} needs more than "
+            f"{choices.NEIGHBORS.get(c.bonus)} transitions in the {updates:g} batches of a step.",
         ),
         (
             4 * c.num_envs > c.replay_size,

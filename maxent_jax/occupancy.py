@@ -197,20 +197,21 @@ def score(
     Args:
       points: [M, F] the reference.
       rows: [M] int32, which row of the occupancy each point is; -1 for none. A state does not see
-        itself, nor, with leave_own_out, any state of its own policy. Points of a history carry no
-        row: a state that entered it is not told apart.
+        itself, nor, with leave_own_out, any state of its own policy, unless that leaves fewer than
+        k. Points of a history carry no row: a state that entered it is not told apart.
       archive: whose policies are scored.
       num_filled: [] how many of the points are there; all when left out.
     """
     config = parts.config
     num_rows = occupancy.policy.shape[0]
-    itself = jnp.arange(num_rows, dtype=jnp.int32)
-    label, point_label = itself, rows
+    capacity = jax.tree.leaves(archive.parameters)[0].shape[0]
+    label = capacity + jnp.arange(num_rows, dtype=jnp.int32)  # by itself, or by its policy
     if config.leave_own_out:
-        # A mixture of one policy would be left with nothing.
-        alone = archive.size == 1
-        label = jnp.where(alone, itself, occupancy.policy)
-        point_label = jnp.where(alone | (rows < 0), rows, occupancy.policy[rows])
+        owner = jnp.where(rows < 0, -1, occupancy.policy[rows])
+        others = jnp.sum(owner[None] != jnp.arange(capacity)[:, None], axis=1)  # [P]
+        alone = others < config.num_neighbors
+        label = jnp.where(alone[occupancy.policy], label, occupancy.policy)
+    point_label = label[rows]
     point_label = jnp.where(rows < 0, NONE_EXCLUDED - 1, point_label)
     distance = knn_distances(
         occupancy.features,
@@ -222,7 +223,6 @@ def score(
     )[:, -1]
     reward = rewards.of_distance(distance, config.reward, config.reward_distance, points.shape[1])
     alive = occupancy.alive.astype(jnp.float32)
-    capacity = jax.tree.leaves(archive.parameters)[0].shape[0]
     total = jnp.zeros(capacity).at[occupancy.policy].add(jnp.where(alive > 0, reward, 0.0))
     lived = jnp.zeros(capacity).at[occupancy.policy].add(alive)
     played = jnp.zeros(capacity).at[occupancy.episode_policy].add(1.0)

@@ -101,10 +101,9 @@ IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
 }
 
 # The learner of methods as their authors published them, and of the baselines, whatever the preset.
-PLAIN: dict[str, Any] = dict(
-    shaping=0.0, shaping_survives_death=False, return_steps=1, reward_scale=1.0
-)
-_AS_PUBLISHED: dict[str, Any] = PLAIN | dict(episodic_weight=0.0)
+PLAIN: dict[str, Any] = dict(shaping=0.0, shaping_survives_death=False, return_steps=1)
+# Bonuses are divided by their deviation; the distance to the reference has its own scale instead.
+_AS_PUBLISHED: dict[str, Any] = PLAIN | dict(episodic_weight=0.0, reward_scale=1.0)
 OF_METHOD: dict[str, dict[str, Any]] = {
     "h-official": _AS_PUBLISHED | dict(bonus="histogram", mixing="step", leave_own_out=False),
     **{name: _AS_PUBLISHED | dict(bonus=name) for name in BASELINES},

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from maxent_jax import algorithm, experience, mixture, parts, training
+from maxent_jax import algorithm, experience, mixture, occupancy, parts, training
 from maxent_jax.config import preset
 
 TINY = dict(num_segments=1, mixture_episodes=4, num_iterations=3, shaping=1.0, backend="mujoco")
@@ -129,6 +129,36 @@ def test_h_starts_from_scratch_la_goes_on_and_v_from_the_best():
     for i in range(2):
         archived = mixture.policy(before.archive, jnp.asarray(i))
         assert not leaves_equal(archived.actor, begun.learner.agent.parameters.actor)
+
+
+def test_fully_corrective_weights_are_measured_on_episodes_that_they_were_not_fitted_to(
+    monkeypatch,
+):
+    seen = {}
+    corrected, measures = occupancy.corrected, occupancy.measures
+
+    def fit(p, visited, weights):
+        seen["fitted"] = visited
+        return corrected(p, visited, weights)
+
+    def measure(p, visited, key):
+        seen["measured"] = visited
+        return measures(p, visited, key)
+
+    monkeypatch.setattr(occupancy, "corrected", fit)
+    monkeypatch.setattr(occupancy, "measures", measure)
+    config = preset("smoke", env="pendulum", weights="fully_corrective", mixture_episodes=8)
+    p = parts.make(config)
+    program = jax.jit(lambda state: (algorithm.end(config, state)[1], dict(seen)))
+    metrics, found = program(algorithm.start(config))  # two policies alike, each with its noise
+    assert not np.array_equal(found["fitted"].states, found["measured"].states)
+    fitted = corrected(p, found["fitted"], jnp.array([0.5, 0.5, 0.0]))[1]
+    np.testing.assert_allclose(metrics["mixture_weights"], fitted, atol=1e-5)
+    share = np.bincount(found["measured"].policy, found["measured"].weight, minlength=3)
+    np.testing.assert_allclose(share, fitted, atol=1e-5)
+    assert abs(fitted[0] - 0.5) > 0.01
+    logs = np.log(np.maximum(fitted, 1e-30))
+    np.testing.assert_allclose(metrics["effective_policies"], np.exp(-fitted @ logs), rtol=1e-4)
 
 
 @pytest.mark.parametrize("method", ["h", "v"])

@@ -54,6 +54,8 @@ def test_presets_are_valid_in_every_environment_and_survive_a_round_trip(name, e
         (dict(replay_dtype="bfloat16"), "did you mean 'float16'"),
         (dict(replay_dtype="float16", yaw_copies=1), "need states in float32"),
         (dict(return_steps=0), "at least 1"),
+        (dict(method="apt", batch_size=12), "apt needs more than 12 transitions in the 1 batches"),
+        (dict(method="h-official", start="best"), "none is the best to start from"),
         (dict(plateau_segments=2), "at most half of num-segments = 2"),
         (dict(plateau_tolerance=-0.1), "0 or more"),
     ],

@@ -55,7 +55,7 @@ def test_all_methods_of_a_study_have_one_budget_and_one_environment(name, scale)
 @pytest.mark.parametrize("scale", protocol.SCALES)
 @pytest.mark.parametrize("name", ["baselines", "published"])
 def test_methods_that_are_compared_by_their_rewards_have_one_learner(name, scale):
-    rewards = {"method", "bonus", "mixing", "leave_own_out"}
+    rewards = {"method", "bonus", "mixing", "leave_own_out", "reward_scale"}
     for cell in (cells := protocol.make(name, scale)):
         of_env = [other for other in cells if other.config.env == cell.config.env]
         fields = dataclasses.asdict(cell.config)
@@ -87,6 +87,7 @@ def test_fewer_seeds_are_a_part_of_the_study():
         (["stael"], "did you mean 'stale'"),
         (["fig4", "--scale", "cpus"], "did you mean 'cpu'"),
         (["fig3", "--no-figures"], "has no cells"),
+        (["fig2", "--shard", "0/2"], "has no cells"),
         (["fig4", "--seeds", "0"], "at least 1"),
         (["fig4", "--jobs", "0"], "at least 1"),
         (["fig4", "--shard", "2/2"], "0 <= I < N"),
@@ -113,6 +114,8 @@ def test_bad_input_is_met_without_jax():
 def test_a_directory_belongs_to_one_study_and_may_gain_seeds(tmp_path):
     directory = tmp_path / "fig4"
     one, two = (protocol.make("fig4", "cpu", seeds) for seeds in (1, 2))
+    directory.mkdir()
+    (directory / "study.tmp.json").write_text("{")  # of a process that was killed in its first step
     protocol.claim(directory, "fig4", "cpu", two)
     protocol.claim(directory, "fig4", "cpu", one)
     held = json.loads((directory / protocol.STUDY).read_text())
@@ -309,12 +312,19 @@ def test_what_methods_differ_in_as_a_number_is_an_axis():
 
     values = {"a": np.array([[0.0, 4.0], [0.0, 8.0]]), "b": np.array([[9.0, 1.0], [9.0, 3.0]])}
     names = ("env_steps", *(name for name, _ in paper_figures.QUANTITIES))
+    values["c"] = values["b"] + 4  # placed where b is, as two periods of a short iteration
     groups = [("ant", m, dict.fromkeys(names, column)) for m, column in values.items()]
-    figure = paper_figures.along(groups, {("ant", "a"): 10.0, ("ant", "b"): 0.0}, "λ", "title")
-    for ax in figure.axes:
-        middle, *seeds = (np.asarray(line.get_xydata()).tolist() for line in ax.get_lines())
-        assert middle == [[0, 2], [10, 6]]
-        assert seeds == [[[0, 1], [10, 4]], [[0, 3], [10, 8]]]
+    of_random = {"env_steps": np.zeros((2, 1)), "cumulative_coverage": np.array([[5.0], [7.0]])}
+    groups.append(("ant", raw.RANDOM, of_random))
+    places = {("ant", "a"): 10.0, ("ant", "b"): 0.0, ("ant", "c"): 0.0}
+    figure = paper_figures.along(groups, places, "λ", "title")
+    drawn = [[np.asarray(line.get_xydata()) for line in ax.get_lines()] for ax in figure.axes]
+    assert [len(lines) for lines in drawn] == [4, 3, 3, 3]
+    for middle, *seeds in drawn:
+        assert middle.tolist() == [[0, 2], [0, 6], [10, 6]]
+        assert seeds[0].tolist() == [[0, 1], [0, 5], [10, 4]]
+        assert seeds[1].tolist() == [[0, 3], [0, 7], [10, 8]]
+    assert (drawn[0][-1][:, 1] == 6).all()
 
 
 def test_the_raw_values_are_those_of_the_runs(finished):
@@ -440,6 +450,10 @@ def test_the_weights_of_the_classic_environments_are_computed_once(tmp_path, mon
         runs_of = [np.array(values["fresh_entropy"]) for values in of_env["weightings"].values()]
         assert all(values.shape == (1, 3) and np.isfinite(values).all() for values in runs_of)
         np.testing.assert_array_equal(runs_of[0][:, 0], runs_of[1][:, 0])  # one policy, one weight
+    curves = classic_weights.curves(found)["pendulum"]
+    beside = found["pendulum"]["weightings"]["η = 0.1"]["random_fresh_entropy"]
+    assert curves["fresh_entropy"][raw.RANDOM].shape == (1, 3)  # the seeds once, not per weighting
+    np.testing.assert_allclose(curves["fresh_entropy"][raw.RANDOM], beside, rtol=1e-6)
     table = classic_weights.table(found)
     assert "probability_of_improvement" not in table["pendulum, fresh_entropy"]["uniform"]
     assert 0 <= table["pendulum, fresh_entropy"]["η = 0.1"]["probability_of_improvement"] <= 1

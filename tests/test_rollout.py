@@ -321,6 +321,29 @@ def test_a_parked_policy_scores_low_only_among_its_own_states():
     assert best == {False: 0, True: 1}
 
 
+def test_a_policy_that_made_the_whole_reference_sees_its_own_states(key):
+    # As the newest does, where it has all the weight; the others see it as ever.
+    found = hand_made(key)
+    rows = jnp.flatnonzero((found.policy == 2) & found.alive).astype(jnp.int32)
+    for num_foreign in (0, 2, 3):
+        seen = jnp.concatenate([rows, jnp.arange(num_foreign, dtype=jnp.int32)])
+        assert (found.policy[seen] != 2).sum() == num_foreign
+        scores = {
+            leave_own_out: occupancy.score(
+                Parts(preset("smoke", leave_own_out=leave_own_out), *[None] * 5),
+                found,
+                found.features[seen],
+                seen,
+                archive_of(3),
+            ).step_reward
+            for leave_own_out in (False, True)
+        }
+        assert (scores[True][:3] < 10).all()  # with no point left a step would pay 88
+        enough = num_foreign >= 3  # k
+        assert (scores[True][2] > scores[False][2]) == enough
+        np.testing.assert_array_equal(scores[True][2] == scores[False][2], not enough)
+
+
 def test_a_policy_without_weight_is_scored_all_the_same(key):
     # As MaxEnt-H weighs its older policies: they play, and the mixture does without them.
     found = hand_made(key)

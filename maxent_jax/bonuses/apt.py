@@ -18,9 +18,10 @@ from maxent_jax.bonuses.descent import Learned
 from maxent_jax.bonuses.icm import Icm
 from maxent_jax.bonuses.moments import Moments
 from maxent_jax.bonuses.protocol import Bonus, Setting, Steps
+from maxent_jax.choices import NEIGHBORS
 from maxent_jax.types import Metrics
 
-NUM_NEIGHBORS = 12  # knn_k of URLB
+NUM_NEIGHBORS = NEIGHBORS["apt"]  # knn_k of URLB
 DISTANCE_CLIP = 1e-4  # knn_clip of URLB, in running means
 MEAN_FLOOR = 1e-8  # where all states met so far are one
 

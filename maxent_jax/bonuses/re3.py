@@ -23,9 +23,10 @@ from maxent_jax.bonuses.protocol import (
     Setting,
     Steps,
 )
+from maxent_jax.choices import NEIGHBORS
 from maxent_jax.sac.networks import Mlp
 
-NUM_NEIGHBORS = 3  # k of rad_re3/config.yaml
+NUM_NEIGHBORS = NEIGHBORS["re3"]  # k of rad_re3/config.yaml
 
 
 class Re3(NamedTuple):

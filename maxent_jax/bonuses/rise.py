@@ -14,8 +14,9 @@ import jax
 from maxent_jax import rewards
 from maxent_jax.bonuses import particles, protocol
 from maxent_jax.bonuses.protocol import Bonus, Setting, State, Steps
+from maxent_jax.choices import NEIGHBORS
 
-NUM_NEIGHBORS, ORDER = 5, 0.1  # k and alpha of src/rise.py
+NUM_NEIGHBORS, ORDER = NEIGHBORS["rise"], 0.1  # k and alpha of src/rise.py
 
 
 def make(setting: Setting) -> Bonus:

@@ -18,9 +18,10 @@ from jax.scipy.special import digamma
 
 from maxent_jax.bonuses import particles, protocol
 from maxent_jax.bonuses.protocol import Bonus, Setting, State, Steps
+from maxent_jax.choices import NEIGHBORS
 from maxent_jax.density.knn import smallest_k
 
-NUM_NEIGHBORS = 12  # knn_k of VCSE_SAC/config/agent/sac.yaml
+NUM_NEIGHBORS = NEIGHBORS["vcse"]  # knn_k of VCSE_SAC/config/agent/sac.yaml
 LOG_OFFSET = 1e-5  # of their code
 VARIANCE_FLOOR = 1e-5  # of the values: that of their layer norm
 ROUNDING = 1e-6
