@@ -127,6 +127,7 @@ def along(
                     ax.legend(frameon=False, fontsize=8)
             smallest = min(place for place in x if place > 0)
             ax.set_xscale("symlog", linthresh=smallest, linscale=0.4)
+            ax.set_xlim(x[0] - 0.2 * smallest, 1.3 * x[-1])
             ax.set(title=quantity, xlabel=label)
             ax.grid(alpha=0.25)
     seeds = max(len(columns["env_steps"]) for _, _, columns in groups)
