@@ -21,7 +21,7 @@ SUMMARISED = (
 # What a study's methods may differ in as a number: its name in the figure, and its value.
 ALONG: dict[str, tuple[str, Callable[[Config], float]]] = {
     "refresh_period": (
-        "env steps between refreshes; the last, an iteration",
+        "env steps between refreshes",
         lambda config: (
             methods.row(config).refresh_period * config.num_envs or config.steps_per_iteration
         ),
