@@ -5,23 +5,21 @@ its own. All methods of a study have the same env steps and gradient steps, and 
 same projection. Loads no array library.
 """
 
-import contextlib
 import dataclasses
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import filelock
-
+from experiments import locks
 from experiments.cli import UsageError
 from maxent_jax import integrity, runs
 from maxent_jax.choices import BASELINES, CLASSIC_ENVS
 from maxent_jax.config import DEFAULTS, Config, preset
 from maxent_jax.presets import PLAIN
 
-STUDY, LOCK = "study.json", "lock"
+STUDY = "study.json"
 VERSION = 1  # of a study's directory
 SCALES = ("toy", "cpu", "paper")
 ETAS = (0.1, 0.01, 0.001)
@@ -194,27 +192,8 @@ def claim(directory: Path, study: str, scale: str, cells: list[Cell]) -> None:
             "cells": {cell.name: dataclasses.asdict(cell.config) for cell in cells},
         }
     )
-    with holding(directory):
+    with locks.holding(directory):
         _claim(directory, content)
-
-
-@contextlib.contextmanager
-def holding(directory: Path) -> Iterator[None]:
-    """Makes a directory, and keeps other processes out of it while inside.
-
-    Raises:
-      UsageError: it cannot be written.
-    """
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        lock = filelock.FileLock(directory / LOCK)
-        lock.acquire()
-    except OSError as error:
-        raise UsageError(f"cannot write to {directory}: {error.strerror}.") from None
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def _claim(directory: Path, content: Changes) -> None:
@@ -230,7 +209,7 @@ def _claim(directory: Path, content: Changes) -> None:
         content["cells"] = held["cells"] | content["cells"]
         if content == held:
             return
-    elif any(o.name not in (LOCK, runs.temporary_of(path).name) for o in directory.iterdir()):
+    elif not locks.is_free(directory, STUDY):
         raise UsageError(f"{directory} is no study's, and not empty: choose another --out.")
     runs.write_json(path, content)
 

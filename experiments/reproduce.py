@@ -18,7 +18,7 @@ from typing import Annotated
 
 import tyro
 
-from experiments import cli, protocol, train
+from experiments import cli, locks, protocol, train
 from experiments.interruption import SIGNALS
 from experiments.protocol import Cell
 from maxent_jax import runs
@@ -68,7 +68,7 @@ def main(argv: Sequence[str]) -> None:
     for name, cells in studies.items():
         protocol.claim(arguments.out / name, name, arguments.scale, cells)
     for what in whats:
-        with protocol.holding(arguments.out / what):  # which it can be, before hours of work
+        with locks.holding(arguments.out / what):  # which it can be, before hours of work
             pass
     if studies and arguments.jobs > 1:
         _share(arguments)
@@ -129,7 +129,7 @@ def _train(directory: Path, cells: Sequence[Cell]) -> int:
                 from experiments import driver  # loads jax
 
                 driver.train(cell.config, at, started, driver.Options(fallback=True))
-        except train.BusyError:
+        except locks.BusyError:
             continue
         except (runs.RunError, runs.NonFiniteError) as error:
             print(f"error: {error} Going on with the next.", file=sys.stderr)

@@ -7,7 +7,15 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments import classic_weights, mepol_rows, paper_figures, protocol, raw, statistics
+from experiments import (
+    classic_weights,
+    locks,
+    mepol_rows,
+    paper_figures,
+    protocol,
+    raw,
+    statistics,
+)
 from experiments.protocol import Cell
 from maxent_jax import methods, mixture, plotting, runs
 from maxent_jax.config import Config
@@ -39,7 +47,7 @@ def draw(
 ) -> None:
     """Figures and studies by name, into directories of theirs; prints each file and table."""
     for what in whats:
-        with protocol.holding(out / what):  # of processes that share it, one at a time
+        with locks.holding(out / what):  # of processes that share it, one at a time
             if what == "fig2":
                 fig2(out / "fig2")
             elif what == "fig3":

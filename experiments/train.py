@@ -12,18 +12,10 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import filelock
-
-from experiments import cli
+from experiments import cli, locks
 from experiments.sinks import Sinks
 from maxent_jax import runs
 from maxent_jax.config import Config, preset
-
-LOCK = "lock"  # held while a process trains; the system frees a dead one's
-
-
-class BusyError(cli.UsageError):
-    """Another process trains there."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,21 +92,11 @@ def claimed(arguments: Arguments) -> Iterator[None]:
     """
     directory = arguments.directory
     check_free(arguments)
-    lock = filelock.FileLock(directory / LOCK, timeout=0)
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        lock.acquire()
-    except filelock.Timeout:
-        raise BusyError(f"another process is training in {directory}.") from None
-    except OSError as error:
-        raise cli.UsageError(f"cannot write to {directory}: {error.strerror}.") from None
-    try:
+    with locks.holding(directory, wait=False):
         check_free(arguments)  # again: another process may have been here meanwhile
         if arguments.overwrite:
             _remove_run(directory)
         yield
-    finally:
-        lock.release()
 
 
 def check_free(arguments: Arguments) -> None:
@@ -124,9 +106,8 @@ def check_free(arguments: Arguments) -> None:
       UsageError, RunError: it does not.
     """
     directory = arguments.directory
-    begun = {LOCK, runs.temporary_of(directory / runs.CONFIG).name}  # and not yet a run
     taken = directory.is_file() or (
-        directory.is_dir() and any(path.name not in begun for path in directory.iterdir())
+        directory.is_dir() and not locks.is_free(directory, runs.CONFIG)
     )
     if not taken:
         return

@@ -154,7 +154,7 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
         "env_steps": learner.env_steps,
         "gradient_steps": learner.gradient_steps,
         "mixture_weights": weights,
-        "effective_policies": jnp.exp(-jnp.sum(weights * jnp.log(jnp.maximum(weights, 1e-30)))),
+        "effective_policies": jnp.exp(histogram.shannon_entropy(weights)),
         **coverage("cumulative", learner.visits),
         **(coverage("random", learner.random_visits) if config.random_baseline else {}),
         **occupancy.measures(p, visited, key_rows),

@@ -211,8 +211,7 @@ def score(
         others = jnp.sum(owner[None] != jnp.arange(capacity)[:, None], axis=1)  # [P]
         alone = others < config.num_neighbors
         label = jnp.where(alone[occupancy.policy], label, occupancy.policy)
-    point_label = label[rows]
-    point_label = jnp.where(rows < 0, NONE_EXCLUDED - 1, point_label)
+    point_label = jnp.where(rows < 0, NONE_EXCLUDED - 1, label[rows])
     distance = knn_distances(
         occupancy.features,
         points,
