@@ -1,6 +1,6 @@
 """Which regime takes Ant farthest? Preset `quick` with one thing changed at a time.
 
-Each run is `experiments.train` in a process of its own with its share of the cores; its row joins
+Each run is the command `train` in a process of its own with its share of the cores; its row joins
 the file given by --out as soon as it ends, and a row that is there is not made again.
 """
 

@@ -1,55 +1,6 @@
-"""Compares every file of a run's checkpoints with what was written.
+"""Entry point: maxent_jax/commands/verify.py has what it does."""
 
-Prints a line for each checkpoint, and for each damage; exit code 1 if there is one.
-"""
-
-import dataclasses
-import sys
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated
-
-import tyro
-
-from experiments import cli
-from maxent_jax import integrity, runs
-
-
-@dataclasses.dataclass(frozen=True)
-class Arguments:
-    """Verify the checkpoints of a run."""
-
-    directory: Annotated[Path, tyro.conf.Positional]
-    """The run's directory."""
-
-
-def main(argv: Sequence[str]) -> None:
-    """Loads no array library."""
-    directory = cli.parse(Arguments, argv, "experiments.verify").directory
-    runs.read_config(directory)
-    names = integrity.checkpoints(directory)
-    if not names:
-        raise runs.CheckpointError(f"{directory} holds no complete checkpoint.")
-    if not verify(directory, names):
-        sys.exit(1)
-
-
-def verify(directory: Path, names: Sequence[str]) -> bool:
-    """Whether these checkpoints are intact, with a line printed on each."""
-    intact = True
-    for name in names:
-        damages = list(integrity.damages(directory, name))
-        intact &= not damages
-        files = [p for p in (directory / integrity.FOLDER / name).rglob("*") if p.is_file()]
-        size = sum(path.stat().st_size for path in files) / 1e6
-        print(
-            f"checkpoint {name}: {'damaged' if damages else 'intact'}, "
-            f"{len(files)} files, {size:,.1f} MB"
-        )
-        for damage in damages:
-            print(f"  {damage}")
-    return intact
-
+from maxent_jax.commands import cli
 
 if __name__ == "__main__":
-    cli.entry_point(main)()
+    cli.run("verify")

@@ -30,6 +30,10 @@ STARTS = ("method", "scratch", "last", "best")
 BY_METHOD = -1
 
 
+class UsageError(ValueError):
+    """A command line that asks for something impossible; the message is one sentence."""
+
+
 class ConfigError(ValueError):
     """A setting that no run can have; the message says which, and what to do."""
 

@@ -13,10 +13,10 @@ import pytest
 from nbclient import NotebookClient
 
 import maxent_jax
-from experiments import evaluate
 from maxent_jax import analysis, features, runs
 from maxent_jax.analysis import Paths
 from maxent_jax.choices import ConfigError
+from maxent_jax.commands import evaluate
 from maxent_jax.config import preset
 
 ROOT = Path(__file__).parent.parent

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import maxent_jax
-from experiments import driver
-from experiments.interruption import Interrupted, Interruption
 from maxent_jax import algorithm, checkpoint, integrity, runs
 from maxent_jax.checkpoint import Progress
 from maxent_jax.config import preset
+from maxent_jax.runs import driver
+from maxent_jax.runs.interruption import Interrupted, Interruption
 
 GOLDEN = Path(__file__).parent / "golden"
 

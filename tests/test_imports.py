@@ -12,6 +12,7 @@ PACKAGE = Path(__file__).parent.parent / "maxent_jax"
 ORDER = [
     *("types", "choices", "presets", "config", "convergence"),
     *("runs", "integrity", "headless", "runtime", "native"),
+    *("runs.interruption", "runs.locks", "runs.sinks", "runs.display", "runs.clock", "runs.hosts"),
     *("density.histogram", "density.knn", "density.sharding"),
     *("density.entropy", "density.reservoir"),
     *("envs.physics", "envs.mjx_backend", "envs.mujoco_backend", "envs.torso", "envs.task"),
@@ -22,12 +23,18 @@ ORDER = [
     *("bonuses.rnd", "bonuses.icm", "bonuses.ngu", "bonuses.re3", "bonuses.rise", "bonuses.vcse"),
     *("bonuses.kmeans", "bonuses.apt", "bonuses.histogram", "bonuses"),
     *("theory.bounds", "theory.mdps", "theory.tabular", "theory.optimum", "theory.loop"),
-    *("theory.reference", "theory.peers"),
+    *("theory.reference", "theory.peers", "theory.tabular_problems", "theory.tabular_studies"),
     *("parts", "occupancy", "experience", "training", "algorithm"),
     *("mepol.settings", "mepol.estimates", "mepol.ascent", "mepol"),
     *("official.settings", "official.reinforce", "official.rounds", "official"),
     *("devices", "checkpoint", "dataset", "export", "analysis", "gymnasium_play", "plotting"),
-    *("rendering", "film"),
+    *("theory.tabular_figures", "rendering", "film"),
+    *("visual.figures", "visual.tables", "visual.video", "runs.stages", "runs.driver"),
+    *("studies.statistics", "studies.protocol", "studies.raw", "studies.mepol_rows"),
+    *("studies.classic_weights", "studies.paper_figures", "studies.reproduced"),
+    *("commands.cli", "commands.train", "commands.evaluate", "commands.render"),
+    *("commands.report", "commands.verify", "commands.reproduce", "commands.theory"),
+    *("commands", "__main__"),
 ]
 
 
@@ -54,13 +61,13 @@ def test_a_module_imports_only_what_stands_before_it(name):
 
 
 def test_every_module_has_its_place_in_the_order():
-    found = {module_name(path) for path in PACKAGE.rglob("*.py")} - {"", "density", "sac", "theory"}
-    assert found == set(ORDER)
+    found = {module_name(path) for path in PACKAGE.rglob("*.py")}
+    assert found - {"", "density", "sac", "studies", "theory", "visual"} == set(ORDER)
 
 
 def test_the_command_line_is_checked_without_jax():
     code = (
-        "import sys; from experiments import train, evaluate, render, report\n"
+        "import sys; from maxent_jax.commands import train, evaluate, render, report\n"
         "train.read_arguments(['--preset', 'smoke', '--out', 'nowhere'])\n"
         "sys.exit('jax' in sys.modules)"
     )

@@ -8,7 +8,7 @@ import time
 # The main thread naps in C, where no handler of Python's runs; a signal ends the first nap alone.
 BUSY = """
 import ctypes, sys
-from experiments.interruption import Interruption
+from maxent_jax.runs.interruption import Interruption
 with Interruption() as interruption:
     print("busy", flush=True)
     for _ in range(3):

@@ -13,12 +13,14 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from experiments import cli, driver, paper_figures, protocol, raw, reproduce, reproduced
-from experiments.protocol import Cell
 from maxent_jax import runs
 from maxent_jax.choices import ConfigError
+from maxent_jax.commands import cli, reproduce
 from maxent_jax.config import preset
 from maxent_jax.features import make_feature_map
+from maxent_jax.runs import driver
+from maxent_jax.studies import paper_figures, protocol, raw, reproduced
+from maxent_jax.studies.protocol import Cell
 
 TOY = ["--scale", "toy", "--seeds", "1"]
 ALL = [(name, scale) for name in protocol.STUDIES for scale in protocol.SCALES]
@@ -104,7 +106,7 @@ def test_bad_input_is_one_sentence_before_anything_is_written(tmp_path, argv, se
 
 def test_bad_input_is_met_without_jax():
     code = (
-        "import sys; from experiments import cli, reproduce\n"
+        "import sys; from maxent_jax.commands import cli, reproduce\n"
         "try: reproduce.main(['fig4', '--seeds', '0'])\n"
         "except cli.UsageError: sys.exit('jax' in sys.modules)"
     )
@@ -426,7 +428,7 @@ def test_fig2_is_what_a_solver_of_quadratic_programs_finds(tmp_path):
 
 
 def test_mepol_has_the_env_steps_of_the_study_and_is_computed_once(tmp_path, monkeypatch):
-    from experiments import mepol_rows
+    from maxent_jax.studies import mepol_rows
 
     config = preset("smoke", env="pendulum", num_seeds=2)
     found = mepol_rows.rows(tmp_path, config, 2)
@@ -441,7 +443,7 @@ def test_mepol_has_the_env_steps_of_the_study_and_is_computed_once(tmp_path, mon
 
 
 def test_the_weights_of_the_classic_environments_are_computed_once(tmp_path, monkeypatch):
-    from experiments import classic_weights
+    from maxent_jax.studies import classic_weights
 
     found = classic_weights.results(tmp_path, "toy", 1)
     assert set(found) == {"pendulum", "mountain_car"}

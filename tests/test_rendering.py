@@ -14,11 +14,12 @@ import untrained
 from PIL import Image
 
 import maxent_jax
-from experiments import cli, render, video
 from maxent_jax import analysis, film, headless, parts, rendering, runs
 from maxent_jax.analysis import Paths
+from maxent_jax.commands import cli, render
 from maxent_jax.config import preset
 from maxent_jax.headless import RenderingError
+from maxent_jax.visual import video
 
 ROOT = Path(__file__).parent.parent
 SIZE = 128
@@ -266,7 +267,7 @@ def test_a_backend_that_does_not_draw_is_named(tmp_path, monkeypatch):
 
 
 def refused(*arguments):
-    """What experiments.render says on standard error before it ends with 2."""
+    """What render says on standard error before it ends with 2."""
     line = [sys.executable, "-m", "experiments.render", *map(str, arguments)]
     started = time.monotonic()
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, check=False)

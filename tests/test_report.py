@@ -15,9 +15,10 @@ import pytest
 import untrained
 from PIL import Image
 
-from experiments import report, tables
 from maxent_jax import plotting, runs
+from maxent_jax.commands import report
 from maxent_jax.config import preset
+from maxent_jax.visual import tables
 
 ROOT = Path(__file__).parent.parent
 NAME = '<script>alert(1)<b>&amp;"$x_{'  # markup, and mathematics that does not end

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from tensorboardX.proto import event_pb2
 
-from experiments import sinks
-from experiments.cli import UsageError
-from experiments.sinks import Sinks
+from maxent_jax.choices import UsageError
 from maxent_jax.config import preset
+from maxent_jax.runs import sinks
+from maxent_jax.runs.sinks import Sinks
 
 
 def test_scalars_name_each_finite_number_of_a_column():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments import statistics
+from maxent_jax.studies import statistics
 
 
 def test_the_interquartile_mean_leaves_out_a_quarter_on_either_side_of_all_runs():

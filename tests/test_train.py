@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 import maxent_jax
-from experiments import driver, train
 from maxent_jax import envs, integrity, runs
+from maxent_jax.commands import train
 from maxent_jax.config import preset
+from maxent_jax.runs import driver
 
 ROOT = Path(__file__).parent.parent
 TINY = ("--preset", "smoke", "--num-segments", "1", "--mixture-episodes", "6")

@@ -13,9 +13,9 @@ from typing import Any
 from unittest import mock
 
 from benchmarks.faults import smoke
-from experiments import driver, train
 from maxent_jax import checkpoint, integrity, plotting, runs
-from maxent_jax.runs import SaveError
+from maxent_jax.commands import train
+from maxent_jax.runs import SaveError, driver
 
 MEGABYTES = 16
 # Whose writing meets the full disk, and the most bytes that are left for it.

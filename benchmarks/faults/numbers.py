@@ -11,11 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import driver
 from maxent_jax import checkpoint, envs, integrity, runs
 from maxent_jax.config import preset
 from maxent_jax.envs.pendulum import Pendulum
-from maxent_jax.runs import NonFiniteError
+from maxent_jax.runs import NonFiniteError, driver
 
 
 class Faulty(Pendulum):

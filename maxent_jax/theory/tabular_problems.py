@@ -1,4 +1,4 @@
-"""The MDPs of experiments.theory, what is known of each, and how a run is held against it."""
+"""The MDPs of the command `theory`, what is known of each, and how a run is held against it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import cli
 from maxent_jax import methods
+from maxent_jax.choices import UsageError
 from maxent_jax.theory import bounds, loop, mdps, optimum, tabular
 from maxent_jax.theory.mdps import Dynamics, Mdp
 
@@ -87,7 +87,7 @@ def make(
     try:
         best = [optimum.solve(mdp, smoothing, tolerance) for mdp in of_seeds]
     except optimum.OptimumError as missed:
-        raise cli.UsageError(f"{name}: {missed}: take a larger --tolerance.") from None
+        raise UsageError(f"{name}: {missed}: take a larger --tolerance.") from None
     keys = jax.random.split(jax.random.key(seed), num_seeds)
     with tabular.float64():
         device = tabular.on_device(of_seeds[0])
@@ -123,9 +123,9 @@ def read(path: Path, discount: float) -> Mdp:
         with np.load(path) as file:
             return mdps.discounted(Dynamics(file["transitions"], file["start"]), discount)
     except OSError as mistake:
-        raise cli.UsageError(f"--mdp {path} cannot be read: {mistake.strerror}.") from None
+        raise UsageError(f"--mdp {path} cannot be read: {mistake.strerror}.") from None
     except (KeyError, ValueError) as mistake:
-        raise cli.UsageError(f"--mdp {path} holds no MDP: {str(mistake).strip(chr(39))}.") from None
+        raise UsageError(f"--mdp {path} holds no MDP: {str(mistake).strip(chr(39))}.") from None
 
 
 def run(problem: Problem, row: methods.Row, iterations: int, **options: Any) -> loop.Trace:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.cli import UsageError
+from maxent_jax.choices import UsageError
 from maxent_jax import runs
 from maxent_jax.config import Config
 

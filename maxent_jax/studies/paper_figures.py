@@ -9,11 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from experiments.raw import RANDOM
-from experiments.statistics import interquartile_mean, interval_of_curves
 from maxent_jax import plotting
 from maxent_jax.analysis import load_run, paths
 from maxent_jax.density import histogram
+from maxent_jax.studies.raw import RANDOM
+from maxent_jax.studies.statistics import interquartile_mean, interval_of_curves
 
 AXES = (
     ("iteration", "iteration", 1),
@@ -46,7 +46,7 @@ def weights(by_time: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
 
 
 def classic_weights(found: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]) -> Figure:
-    """Fig. 3, from `experiments.classic_weights.curves`: what the official code plots; its runs
+    """Fig. 3, from `classic_weights.curves`: what the official code plots; its runs
     beside the random policy from their starts; and fresh runs from rest.
     """
     titles = {

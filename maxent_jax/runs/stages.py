@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.clock import Clock
-from experiments.display import Bar
+from maxent_jax.runs.clock import Clock
+from maxent_jax.runs.display import Bar
 from maxent_jax import algorithm, integrity, runs
 from maxent_jax.algorithm import Programs, State
 from maxent_jax.checkpoint import Progress

@@ -13,11 +13,11 @@ from typing import Any
 
 import jax
 
-from experiments import raw
-from experiments.raw import COLUMNS, Row
 from maxent_jax import mepol, parts, runs
 from maxent_jax.config import Config
 from maxent_jax.mepol import Settings
+from maxent_jax.studies import raw
+from maxent_jax.studies.raw import COLUMNS, Row
 
 METHOD, RESULTS = "MEPOL", "mepol.json"
 

@@ -1,29 +1,47 @@
 """From a command line to settings: flags made from fields, one sentence for each mistake."""
 
 import functools
+import importlib
 import io
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr
+from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
 
-from experiments.interruption import Interrupted
-from maxent_jax.choices import ConfigError
+from maxent_jax.choices import ConfigError, UsageError
 from maxent_jax.runs import NonFiniteError, RunError, SaveError
+from maxent_jax.runs.interruption import Interrupted
 
 Arguments = TypeVar("Arguments")
 
 
-class UsageError(ValueError):
-    """A command line that asks for something impossible; the message is one sentence."""
+def run(name: str) -> None:
+    """The entry point of the command of that name, with the arguments of this process."""
+    entry_point(command(name))(sys.argv[1:])
+
+
+def command(name: str) -> Callable[[Sequence[str]], None]:
+    """The main of the command of that name."""
+    return importlib.import_module(f"maxent_jax.commands.{name}").main
+
+
+def spelled(name: str) -> str:
+    """How a user types the command of that name: as the one that is running was typed."""
+    started = Path(sys.argv[0])
+    if started.stem == "maxent-jax":
+        return f"maxent-jax {name}"
+    if started.parent.name == "experiments":
+        return f"python -m experiments.{name}"
+    return f"python -m maxent_jax {name}"
 
 
 def parse(
-    kind: Callable[..., Arguments], argv: Sequence[str], prog: str, default: Any = None
+    kind: Callable[..., Arguments], argv: Sequence[str], name: str, default: Any = None
 ) -> Arguments:
-    """The arguments of `python -m prog` as a dataclass; --help prints its fields and exits.
+    """The arguments of the command of that name; --help prints the fields of `kind` and exits.
 
     Raises:
       UsageError: an unknown flag (with the nearest one), or a value of the wrong type.
@@ -34,7 +52,7 @@ def parse(
         with redirect_stderr(printed):
             return tyro.cli(
                 kind,
-                prog=f"python -m {prog}",
+                prog=spelled(name),
                 args=argv,
                 config=(tyro.conf.OmitArgPrefixes,),
                 **options,
@@ -56,16 +74,16 @@ def flag_value(argv: Sequence[str], flag: str) -> str | None:
     return value
 
 
-def entry_point(main: Callable[[Sequence[str]], None]) -> Callable[[], None]:
+def entry_point(main: Callable[[Sequence[str]], None]) -> Callable[[Sequence[str]], None]:
     """A main that ends with one sentence where it can't go on.
 
     Exit code 2 for a user's mistake, 1 for what the machine or the numbers did.
     """
 
     @functools.wraps(main)
-    def run() -> None:
+    def run(argv: Sequence[str]) -> None:
         try:
-            main(sys.argv[1:])
+            main(argv)
         except (UsageError, ConfigError, RunError) as mistake:
             print(f"error: {mistake}", file=sys.stderr)
             sys.exit(2)

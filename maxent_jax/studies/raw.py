@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments import protocol
-from experiments.protocol import Cell
 from maxent_jax import runs
+from maxent_jax.studies import protocol
+from maxent_jax.studies.protocol import Cell
 
 MEASURED = ("coverage", "entropy", "off_grid_share")
 COLUMNS = (

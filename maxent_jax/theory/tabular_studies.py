@@ -1,4 +1,4 @@
-"""The studies of experiments.theory: each takes problems and returns figures, JSON-ready."""
+"""The studies of the command `theory`: each takes problems and returns figures, JSON-ready."""
 
 import time
 from collections.abc import Callable
@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import special, stats
 
-from experiments import tabular_problems as problems
-from experiments.tabular_problems import FIT_FROM, Problem
 from maxent_jax import methods, rewards
 from maxent_jax.theory import bounds, loop, mdps, optimum, peers, reference, tabular
+from maxent_jax.theory import tabular_problems as problems
+from maxent_jax.theory.tabular_problems import FIT_FROM, Problem
 
 STATES = (2, 10, 100, 1_000, 10_000, 1_000_000)
 ETAS = (0.1, 0.01, 0.001)

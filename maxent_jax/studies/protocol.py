@@ -1,6 +1,6 @@
 """Studies: the runs that an experiment is made of, and what is left of them to do.
 
-A study is a list of cells, and a cell is a run as `experiments.train` makes them, in a directory of
+A study is a list of cells, and a cell is a run as the command `train` makes them, in a directory of
 its own. All methods of a study have the same env steps and gradient steps, and are measured in the
 same projection. Loads no array library.
 """
@@ -12,12 +12,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from experiments import locks
-from experiments.cli import UsageError
 from maxent_jax import integrity, runs
-from maxent_jax.choices import BASELINES, CLASSIC_ENVS
+from maxent_jax.choices import BASELINES, CLASSIC_ENVS, UsageError
 from maxent_jax.config import DEFAULTS, Config, preset
 from maxent_jax.presets import PLAIN
+from maxent_jax.runs import locks
 
 STUDY = "study.json"
 VERSION = 1  # of a study's directory

@@ -8,10 +8,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments import protocol, statistics
-from experiments.cli import UsageError
-from experiments.raw import RANDOM
 from maxent_jax import mixture, official, runs
+from maxent_jax.choices import UsageError
+from maxent_jax.studies import protocol, statistics
+from maxent_jax.studies.raw import RANDOM
 
 SEEDS = {"toy": 2, "cpu": 10, "paper": 10}
 TOY: dict[str, Any] = dict(

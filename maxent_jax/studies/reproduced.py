@@ -7,18 +7,11 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments import (
-    classic_weights,
-    locks,
-    mepol_rows,
-    paper_figures,
-    protocol,
-    raw,
-    statistics,
-)
-from experiments.protocol import Cell
 from maxent_jax import methods, mixture, plotting, runs
 from maxent_jax.config import Config
+from maxent_jax.runs import locks
+from maxent_jax.studies import classic_weights, mepol_rows, paper_figures, protocol, raw, statistics
+from maxent_jax.studies.protocol import Cell
 
 FIG2_TIMES = (5, 10, 20)
 SUMMARISED = (

@@ -1,4 +1,4 @@
-"""The figures of experiments.theory, from its results alone."""
+"""The figures of the command `theory`, from its results alone."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from experiments import figures, hosts
-from experiments.cli import UsageError
-from experiments.clock import Clock
-from experiments.display import Bar
-from experiments.interruption import Interrupted, Interruption
-from experiments.sinks import Sinks
-from experiments.stages import Stage, advance, check_finite
+from maxent_jax.runs import hosts
+from maxent_jax.visual import figures
+from maxent_jax.choices import UsageError
+from maxent_jax.runs.clock import Clock
+from maxent_jax.runs.display import Bar
+from maxent_jax.runs.interruption import Interrupted, Interruption
+from maxent_jax.runs.sinks import Sinks
+from maxent_jax.runs.stages import Stage, advance, check_finite
 from maxent_jax import (
     algorithm,
     checkpoint,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import filelock
 
-from experiments.cli import UsageError
+from maxent_jax.choices import UsageError
 from maxent_jax import runs
 
 LOCK = "lock"

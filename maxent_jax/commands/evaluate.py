@@ -1,0 +1,126 @@
+"""Loads a run, rolls its mixture out anew, and reports what it covers.
+
+Prints a table and writes evaluation.json and figures/ into the run's directory. With --gymnasium it
+also plays the policies in Gymnasium's own environment, and reports the sim-to-sim gap.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from maxent_jax import runs
+from maxent_jax.commands import cli
+
+if TYPE_CHECKING:
+    from maxent_jax.analysis import Run
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Evaluate a run: entropy, coverage, and the returns of each policy."""
+
+    directory: Annotated[Path, tyro.conf.Positional]
+    """The run's directory."""
+    episodes: int = 5
+    """Episodes of each policy."""
+    seed: int = 1
+    """Of the rollouts; training evaluates with 0."""
+    seed_index: int = 0
+    """Which of the seeds trained side by side."""
+    gymnasium: bool = False
+    """Also play as many episodes in Gymnasium (ant, walker2d, humanoid), on C MuJoCo in float64."""
+    fallback: bool = False
+    """Where the last checkpoint is damaged, take the one before."""
+
+
+def main(argv: Sequence[str]) -> None:
+    """Parses and checks, and only then loads jax."""
+    arguments = cli.parse(Arguments, argv, "evaluate")
+    if arguments.episodes < 1 or arguments.seed < 0:
+        raise cli.UsageError("--episodes must be at least 1, and --seed 0 or more.")
+    config = runs.read_config(arguments.directory)
+    from maxent_jax import runtime
+
+    runtime.prepare(config.simulates_in_jax)
+    if arguments.gymnasium:
+        from maxent_jax import gymnasium_play
+
+        gymnasium_play.make(config).close()  # what is wrong is said before anything is rolled out
+    report = evaluate(arguments)
+    runs.write_json(arguments.directory / "evaluation.json", report)
+    _print(report)
+
+
+def evaluate(arguments: Arguments) -> dict[str, Any]:
+    """The report, JSON-ready; the figures are drawn on the way."""
+    import jax.numpy as jnp
+    import numpy as np
+
+    from maxent_jax import analysis, plotting
+    from maxent_jax.density import histogram
+
+    run = analysis.load_run(arguments.directory, arguments.seed_index, arguments.fallback)
+    visited = run.occupancy(arguments.episodes, arguments.seed)
+    cells = histogram.count(visited.states, run.parts.grid, visited.weight)
+    plotting.save_all(run, np.asarray(cells), analysis.paths(visited))
+    return {
+        "run": str(run.path),
+        "trained_with_seed": run.seed,
+        "episodes_per_policy": arguments.episodes,
+        "rollout_seed": arguments.seed,
+        "reward": run.config.reward,
+        "coordinates": run.parts.grid.names,
+        "deviations_from_the_paper": run.config.deviations(),
+        "policies": [s._asdict() for s in run.summaries(visited, arguments.seed)],
+        "training_coverage": int((run.histogram > 0).sum()),
+        "training_entropy": float(histogram.shannon_entropy(jnp.asarray(run.histogram))),
+        **(
+            {"random_coverage": int((run.random_histogram > 0).sum())}
+            if run.config.random_baseline
+            else {}
+        ),
+        **run.measures(visited, arguments.seed),
+        **({"gymnasium": _gap(run, arguments)} if arguments.gymnasium else {}),
+    }
+
+
+def _gap(run: "Run", arguments: Arguments) -> dict[str, Any]:
+    from maxent_jax import gymnasium_play
+
+    measured = gymnasium_play.gap(run, arguments.episodes, arguments.seed)
+    return {
+        "environment": gymnasium_play.IDS[run.config.env],
+        "sets_of_our_own": gymnasium_play.NUM_SETS,
+        "measures": {name: gap._asdict() for name, gap in measured.items()},
+    }
+
+
+def _print(report: dict[str, Any]) -> None:
+    policies = report["policies"]
+    ends = ", ".join(report["coordinates"])
+    print(f"policy  weight   return  reward/step  length  mean end: {ends}")
+    for p in policies:
+        print(
+            f"{p['policy']:6d}  {p['weight']:6.3f}  {p['episode_return']:7.1f}"
+            f"  {p['step_reward']:11.3f}  {p['episode_length']:6.0f}"
+            f"  {p['mean_end'][0]:8.2f} {p['mean_end'][1]:8.2f}"
+        )
+    for name, value in report.items():
+        if isinstance(value, int | float):
+            print(f"{name}: {value:.4g}" if isinstance(value, float) else f"{name}: {value:,}")
+    if "gymnasium" in report:
+        _print_gap(report["gymnasium"])
+
+
+def _print_gap(report: dict[str, Any]) -> None:
+    num_sets, environment = report["sets_of_our_own"], report["environment"]
+    print(f"in our simulator (mean of {num_sets} sets of episodes) and in {environment}:")
+    print(f"{'':29}ours  Gymnasium  difference  by chance")
+    for name, gap in report["measures"].items():
+        print(
+            f"{name:25}  {gap['ours']:6.4g}  {gap['gymnasium']:9.4g}"
+            f"  {gap['difference']:10.3g}  {gap['chance']:9.3g}"
+        )

@@ -1,0 +1,160 @@
+"""Films a run's archived policies, one by one and side by side, with no screen.
+
+Writes videos/policy_<i>.mp4, its strip of stills policy_<i>.png, and mixture.mp4 and mixture.png,
+where all policies play at once, into the run's directory.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from maxent_jax import headless, runs
+from maxent_jax.commands import cli
+from maxent_jax.runs import display
+from maxent_jax.visual import video
+
+if TYPE_CHECKING:
+    from maxent_jax.analysis import Run
+    from maxent_jax.film import Episode, Film
+
+FRAMES_PER_SECOND = 20  # about; fewer where a step of the environment lasts longer
+VIDEO_SECONDS = 25
+SIZES = (128, 1080)  # of a picture, pixels
+MOST_STILLS = 20
+ASPECT = 16 / 9  # of all policies at once, about
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Film a run: a video and a strip of stills of each policy, and of all at once."""
+
+    directory: Annotated[Path, tyro.conf.Positional]
+    """The run's directory."""
+    policy: int | None = None
+    """Film this policy alone."""
+    episodes: int = 5
+    """Episodes rolled out with each policy; the one of median length is shown."""
+    speed: float | None = None
+    """Of playback: how many seconds of the simulation pass in one. Left out: 1, and more where an
+    episode that reaches its time limit would last longer than 25 s."""
+    size: int = 480
+    """Side of a policy's video in pixels, a multiple of 4; beside others it has half of it."""
+    stills: int = 6
+    """In a strip, equally spaced in time."""
+    seed: int = 1
+    """Of the rollouts; training evaluates with 0."""
+    seed_index: int = 0
+    """Which of the seeds trained side by side."""
+    fallback: bool = False
+    """Where the last checkpoint is damaged, take the one before."""
+
+
+def main(argv: Sequence[str]) -> None:
+    """Parses and checks, and only then loads jax and MuJoCo."""
+    arguments = cli.parse(Arguments, argv, "render")
+    config = runs.read_config(arguments.directory)
+    _check(arguments, config.archive_size)
+    headless.check_drawable(config.env)
+    video.check()
+    headless.choose_backend()
+    from maxent_jax import runtime
+
+    runtime.prepare(config.simulates_in_jax)
+    _film(arguments)
+
+
+def folder(directory: Path, num_seeds: int, seed_index: int) -> Path:
+    """Where the films of a seed lie."""
+    videos = directory / "videos"
+    return videos if num_seeds == 1 else videos / f"seed_{seed_index}"
+
+
+def _check(arguments: Arguments, num_policies: int) -> None:
+    policy, (smallest, largest) = arguments.policy, SIZES
+    for wrong, sentence in (
+        (
+            policy is not None and not 0 <= policy < num_policies,
+            f"--policy is {policy}, but the run has policies 0 to {num_policies - 1}.",
+        ),
+        (arguments.episodes < 1, "--episodes must be at least 1."),
+        (
+            arguments.speed is not None and not 0.01 <= arguments.speed <= 1000,
+            "--speed must be from 0.01 to 1,000.",
+        ),
+        (
+            not smallest <= arguments.size <= largest or arguments.size % 4,
+            f"--size must be a multiple of 4 from {smallest} to {largest:,}.",
+        ),
+        (
+            not 1 <= arguments.stills <= MOST_STILLS,
+            f"--stills must be from 1 to {MOST_STILLS}.",
+        ),
+        (arguments.seed < 0, "--seed must be 0 or more."),
+    ):
+        if wrong:
+            raise cli.UsageError(sentence)
+
+
+def _film(arguments: Arguments) -> None:
+    from maxent_jax import analysis, film, rendering
+
+    run = analysis.load_run(arguments.directory, arguments.seed_index, arguments.fallback)
+    _check(arguments, run.num_policies)  # fewer than planned where the run is not finished
+    with (
+        rendering.scene(run.parts, arguments.size) as large,
+        rendering.scene(run.parts, arguments.size // 2) as small,
+    ):
+        episodes = film.median_episodes(run, run.rollout(arguments.episodes, arguments.seed))
+        speed = arguments.speed or max(1.0, _seconds_in_an_episode(run) / VIDEO_SECONDS)
+        shot = film.make(run, large, episodes, speed)
+        where = folder(run.path, run.config.num_seeds, arguments.seed_index)
+        studio = _Studio(where, speed, shot._replace(scene=small, speed=None), arguments.stills)
+        for i, episode in enumerate(episodes):
+            if arguments.policy in (None, i):
+                studio.film(f"policy_{i}", shot, [episode])
+        if arguments.policy is None:
+            studio.film("mixture", shot._replace(scene=small), episodes)
+    print(
+        f"{where}: {studio.num_videos} videos and their stills; the longest lasts "
+        f"{studio.longest:.1f} s, at {speed:g} times the simulation's speed."
+    )
+
+
+def _seconds_in_an_episode(run: "Run") -> float:
+    return run.config.episode_length * float(run.parts.env.dt)
+
+
+class _Studio:
+    """Makes a video and a strip of stills of some episodes."""
+
+    def __init__(self, where: Path, speed: float, still: "Film", num_stills: int):
+        self._folder, self._still, self._num_stills = where, still, num_stills
+        self._every = max(1, round(speed / (FRAMES_PER_SECOND * still.seconds)))
+        self._frame_rate = speed / (self._every * still.seconds)
+        self.num_videos, self.longest = 0, 0.0  # seconds
+
+    def film(self, name: str, shot: "Film", episodes: Sequence["Episode"]) -> None:
+        """The episodes at once, to the end of the longest."""
+        from PIL import Image
+
+        from maxent_jax import film
+
+        length = max(len(episode.states) for episode in episodes)
+        columns = min(len(episodes), math.ceil(math.sqrt(ASPECT * len(episodes))))
+        steps = range(0, length, self._every)
+        frames = (
+            film.mosaic([film.picture(shot, episode, step) for episode in episodes], columns)
+            for step in display.track(steps, name)
+        )
+        with runs.whole_file(self._folder / f"{name}.mp4") as temporary:
+            video.write(temporary, frames, self._frame_rate)
+        self.num_videos += 1
+        self.longest = max(self.longest, len(steps) / self._frame_rate)
+        shown = film.stills(length, self._num_stills)
+        tiles = [film.picture(self._still, episode, step) for episode in episodes for step in shown]
+        with runs.whole_file(self._folder / f"{name}.png") as temporary:
+            Image.fromarray(film.mosaic(tiles, columns=len(shown))).save(temporary)

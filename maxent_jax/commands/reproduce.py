@@ -1,0 +1,175 @@
+"""Reproduces the paper's figures, put right, and runs the ablations that its readers asked for.
+
+A study's directory holds study.json, a run for each of its cells and, once all are finished,
+raw.csv, summary.json and its figure. Killed and started again, it goes on with what is left;
+several processes may share a directory, and machines that share none may share the cells.
+"""
+
+import dataclasses
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from maxent_jax import runs
+from maxent_jax.choices import check_choice
+from maxent_jax.commands import cli, train
+from maxent_jax.runs import locks
+from maxent_jax.runs.interruption import SIGNALS
+from maxent_jax.studies import protocol
+from maxent_jax.studies.protocol import Cell
+
+# What a figure of the paper is made of: studies, by name. Fig. 3's other half, weights on Ant, is
+# the study `weights`: on a CPU it takes longer than all the rest.
+FIGURES: dict[str, tuple[str, ...]] = {
+    "fig2": (),
+    "fig3": (),
+    "fig4": ("fig4",),
+    "fig5": ("fig4",),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Reproduce a figure of the paper, or run a study."""
+
+    what: Annotated[str, tyro.conf.Positional]
+    """fig2, fig3, fig4, fig5, all of these (all), or the name of a study."""
+    scale: str = "cpu"
+    """toy (does it run?), cpu (two cores), or paper (the paper's settings, for accelerators)."""
+    out: Path = Path("studies")
+    """Where every study and figure has its directory."""
+    seeds: int | None = None
+    """Of each method; as many as the scale says if left out."""
+    jobs: int = 1
+    """Processes that share the cells and the cores of this machine."""
+    shard: str = "0/1"
+    """I/N: the cells I, I + N, I + 2N, ... alone, for arrays of jobs."""
+    figures: bool = True
+    """Draw, once all cells are finished."""
+
+
+def main(argv: Sequence[str]) -> None:
+    """Parses and checks, and only then trains."""
+    arguments = cli.parse(Arguments, argv, "reproduce")
+    index, count = _check(arguments)
+    whats = tuple(FIGURES) if arguments.what == "all" else (arguments.what,)
+    names = dict.fromkeys(name for what in whats for name in FIGURES.get(what, (what,)))
+    studies = {name: protocol.make(name, arguments.scale, arguments.seeds) for name in names}
+    if "fig3" in whats:
+        from maxent_jax.studies import classic_weights  # loads jax
+
+        classic_weights.held(arguments.out / "fig3", arguments.scale, arguments.seeds)
+    for name, cells in studies.items():
+        protocol.claim(arguments.out / name, name, arguments.scale, cells)
+    for what in whats:
+        with locks.holding(arguments.out / what):  # which it can be, before hours of work
+            pass
+    if studies and arguments.jobs > 1:
+        _share(arguments)
+    else:
+        failures = sum(
+            _train(arguments.out / name, cells[index::count]) for name, cells in studies.items()
+        )
+        if failures:
+            sys.exit(1)
+    left = [
+        f"{name}/{cell.name}"
+        for name, cells in studies.items()
+        for cell in cells
+        if not protocol.finished(arguments.out / name, cell)
+    ]
+    if left and arguments.figures:
+        print(f"{len(left)} cells are not finished, {left[0]} the first: no figures yet.")
+    elif arguments.figures:
+        from maxent_jax import runtime
+        from maxent_jax.studies import reproduced  # loads jax
+
+        runtime.prepare(simulates_in_jax=False)
+        reproduced.draw(whats, arguments.scale, arguments.seeds, arguments.out, studies)
+
+
+def _check(arguments: Arguments) -> tuple[int, int]:
+    """The shard."""
+    check_choice("study", arguments.what, ("all", *FIGURES, *protocol.STUDIES))
+    check_choice("scale", arguments.scale, protocol.SCALES)
+    if arguments.seeds is not None and arguments.seeds < 1:
+        raise cli.UsageError(f"seeds is {arguments.seeds}, but a study needs at least 1.")
+    if arguments.jobs < 1:
+        raise cli.UsageError(f"jobs is {arguments.jobs}, but must be at least 1.")
+    shard = re.fullmatch(r"([0-9]+)/([0-9]+)", arguments.shard)
+    if shard is None or int(shard[1]) >= int(shard[2]):
+        raise cli.UsageError(f"shard is {arguments.shard}, but must be I/N with 0 <= I < N.")
+    if FIGURES.get(arguments.what) == () and (not arguments.figures or int(shard[2]) > 1):
+        raise cli.UsageError(
+            f"{arguments.what} has no cells to share: leave out --shard and --no-figures."
+        )
+    if arguments.out.is_file():
+        raise cli.UsageError(f"out {arguments.out} is a file: name a folder.")
+    return int(shard[1]), int(shard[2])
+
+
+def _train(directory: Path, cells: Sequence[Cell]) -> int:
+    """What is left of the cells; those that another process trains are passed over, and so is one
+    that cannot be trained, with its sentence. How many those are.
+    """
+    failures = 0
+    for cell in cells:
+        started = time.perf_counter()
+        try:
+            if protocol.finished(directory, cell):
+                continue
+            at = protocol.home(directory, cell)
+            with train.claimed(train.Arguments(cell.config, out=at, resume=True)):
+                from maxent_jax.runs import driver  # loads jax
+
+                driver.train(cell.config, at, started, driver.Options(fallback=True))
+        except locks.BusyError:
+            continue
+        except (runs.RunError, runs.NonFiniteError) as error:
+            print(f"error: {error} Going on with the next.", file=sys.stderr)
+            failures += 1
+    return failures
+
+
+def _share(arguments: Arguments) -> None:
+    """As many processes as jobs, each on its share of the cores, until all have ended.
+
+    What this process is told by a signal, it tells them; they save themselves.
+    """
+    command = [sys.executable, "-m", "reproduce", arguments.what, "--no-figures"]
+    for name in ("scale", "out", "seeds", "shard"):
+        value = getattr(arguments, name)
+        command += [] if value is None else [f"--{name}", str(value)]
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    processes: list[subprocess.Popen[bytes]] = []
+
+    def tell(number: int, _: object) -> None:
+        for process in processes:
+            process.send_signal(number)
+
+    handlers = [signal.signal(number, tell) for number in SIGNALS]
+    try:
+        for i in range(arguments.jobs):
+            # In a group of its own, so that Ctrl-C reaches it once.
+            processes.append(subprocess.Popen(command, process_group=0))
+            if cores:  # before its threads start, which inherit it
+                os.sched_setaffinity(processes[-1].pid, cores[i :: arguments.jobs] or cores)
+        codes = [process.wait() for process in processes]
+    finally:
+        for number, handler in zip(SIGNALS, handlers, strict=True):
+            signal.signal(number, handler)
+    worst = max(code if code >= 0 else 128 - code for code in codes)
+    if worst:
+        print(
+            f"error: {sum(map(bool, codes))} of {len(codes)} jobs did not finish: see above.",
+            file=sys.stderr,
+        )
+        sys.exit(worst)

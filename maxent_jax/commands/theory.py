@@ -1,0 +1,184 @@
+"""Holds MaxEnt-H, LA and V against their bounds and the true optimum, exactly, in tabular MDPs.
+
+Prints tables, and writes the results as JSON and the figures as PNG.
+"""
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from maxent_jax import runs
+from maxent_jax.commands import cli
+from maxent_jax.runs import display
+
+FITTED = ("river swim", "Garnet", "double chain", "four rooms", "open grid")
+PLAIN = ("river swim", "Garnet", "double chain", "small rooms")  # where an iteration costs little
+ON_GRIDS = 300  # iterations of the comparison elsewhere
+PLANNING_BUDGET, TOY_BUDGET = 4096, 16
+SAMPLES, TOY_SAMPLES = (1_000, 10_000, 100_000), (500, 1_000)
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """The theory, held against exact computation in tabular MDPs."""
+
+    out: Path = Path("theory.json")
+    """Results as JSON."""
+    figures: Path | None = None
+    """A folder for the figures; that of the results if left out."""
+    iterations: int = 1000
+    """T of the rate's fit."""
+    seeds: int = 20
+    """First policies, and Garnets, for the rate's fit."""
+    few_seeds: int = 5
+    """First policies elsewhere."""
+    seed: int = 0
+    """Of everything random."""
+    discount: float = 0.95
+    """γ of the discounted MDPs."""
+    tolerance: float = 1e-8
+    """Of the optimum's duality gap, nats."""
+    mdp: Path | None = None
+    """An MDP of your own in place of the five: .npz with transitions [S, A, S] and start [S]."""
+    toy: bool = False
+    """Does it run? Tiny MDPs and few iterations, whatever the other sizes say."""
+
+
+def main(argv: Sequence[str]) -> None:
+    """Parses and checks, and only then computes."""
+    arguments = _check(cli.parse(Arguments, argv, "theory"))
+    from maxent_jax import runtime
+
+    runtime.prepare(simulates_in_jax=False)
+    results = runs.jsonable(study(arguments))
+    from maxent_jax.theory import tabular_figures
+
+    folder = arguments.figures or arguments.out.parent
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    runs.write_json(arguments.out, results)
+    paths = tabular_figures.draw(results, folder)
+    _print(results)
+    print(", ".join(str(path) for path in (arguments.out, *paths)))
+
+
+def study(arguments: Arguments) -> dict[str, Any]:
+    """Every study, JSON-ready.
+
+    Raises:
+      UsageError: no MDP in the user's file, or a tolerance that an optimum can't be found to.
+    """
+    from maxent_jax.theory import tabular_problems as problems
+    from maxent_jax.theory import tabular_studies as studies
+
+    started, track = time.perf_counter(), display.track
+    known = (
+        problems.known(arguments.seeds, arguments.discount, arguments.toy)
+        if arguments.mdp is None
+        else {arguments.mdp.stem: [problems.read(arguments.mdp, arguments.discount)]}
+    )
+    made = {
+        name: problems.make(name, known[name], arguments.seeds, arguments.seed, arguments.tolerance)
+        for name in track(list(known), "optima")
+    }
+    few = {name: problem.seeds(arguments.few_seeds) for name, problem in made.items()}
+
+    def among(*names: str) -> list[str]:
+        return [name for name in names if name in made] or list(made)  # a user's own
+
+    T, budget = arguments.iterations, TOY_BUDGET if arguments.toy else PLANNING_BUDGET
+    fitted, plain = among(*FITTED), among(*PLAIN)
+    noisy, played = among("Garnet")[0], among("double chain")[0]
+    results = {
+        "settings": dataclasses.asdict(arguments) | {"out": None, "figures": None},
+        "versions": runs.stack(),
+        "bounds": studies.bound_table(),
+        "rates": {name: studies.rate(made[name], T) for name in track(fitted, "rates")},
+        "methods": {
+            name: studies.compare(few[name], T if name in plain else min(T, ON_GRIDS))
+            for name in track(fitted, "methods")
+        },
+        "refresh": {name: studies.refresh(few[name], budget) for name in track(plain, "refresh")},
+        "noise": {"on": noisy, "rows": studies.noise(few[noisy], T)},
+        "game": {"on": played, "gap": studies.game(few[played], T, arguments.tolerance)},
+        "lost": studies.lost(
+            6 if arguments.toy else 20, arguments.few_seeds, arguments.seed, arguments.tolerance, T
+        ),
+        "proposition_1": studies.proposition_1(TOY_SAMPLES if arguments.toy else SAMPLES),
+    }
+    return results | {"wall_seconds": time.perf_counter() - started}
+
+
+def _check(arguments: Arguments) -> Arguments:
+    """With toy sizes where asked."""
+    if arguments.toy:
+        arguments = dataclasses.replace(arguments, iterations=40, seeds=2, few_seeds=2)
+    for wrong, sentence in (
+        (
+            not 0 < arguments.discount < 1,
+            f"--discount is {arguments.discount}, but must be above 0 and below 1.",
+        ),
+        (
+            not 0 < arguments.tolerance < float("inf"),
+            f"--tolerance is {arguments.tolerance}, but must be a positive number.",
+        ),
+        (arguments.iterations < 20, "--iterations must be at least 20, to fit a rate."),
+        (
+            not 1 <= arguments.few_seeds <= arguments.seeds or arguments.seeds < 2,
+            "--seeds must be at least 2, and --few-seeds from 1 up to as many.",
+        ),
+        (not 0 <= arguments.seed < 2**31, "--seed must be 0 or more, and below 2^31."),
+        (arguments.out.is_dir(), f"--out {arguments.out} is a folder: name a file."),
+    ):
+        if wrong:
+            raise cli.UsageError(sentence)
+    return arguments
+
+
+def _print(results: Mapping[str, Any]) -> None:
+    print("      |S|    η below     H needs T   H_σ, σ = 1/|S|, from T   entropy from T")
+    for row in results["bounds"]:
+        print(
+            f"{row['states']:9,d}  {row['eta_upper_bound']:9.3g}  {row['min_iterations']:12,d}"
+            f"  {row['smoothed_from']:23,d}  {row['entropy_from']:15,d}"
+        )
+    for name, found in results["rates"].items():
+        low, high = found["slope_interval"]
+        print(
+            f"{name}: |S| {found['states']}, optimum {found['optimum']:.4f}, duality gap "
+            f"{found['duality_gap']:.1e}; V's gap {found['final_gap']:.2e}, slope "
+            f"{found['slope']:.2f} [{low:.2f}, {high:.2f}], linear share "
+            f"{found['linear_share']:.2f}; at most {found['largest_share_of_bound']:.2g} of the "
+            f"bound, which is below half of log|S| from T = {found['informative_from']:,} on"
+        )
+    for name, found in (results["methods"] | {"long river swim": results["lost"]}).items():
+        print(f"{name}: gap at the end, mean of the last tenth, largest share of the bound")
+        for method, curve in found["methods"].items():
+            print(f"  {method:20} {_row(curve)}")
+    for name, found in results["refresh"].items():
+        print(f"{name}: median gap after {found['budget']:,} planning steps by refresh period")
+        print(f"  {'':14}" + "".join(f"{period:9d}" for period in found["periods"]))
+        for series, gap in found["gap"].items():
+            print(f"  {series:14}" + "".join(f"{statistics.median(g):9.1e}" for g in gap))
+        print(f"  better than V with LA's iterations up to a period of: {found['better_until']}")
+    print(f"{results['noise']['on']}, V: ε₀, ε₁, gap, Theorem 1")
+    for row in results["noise"]["rows"]:
+        print("  " + "  ".join(f"{row[key]:8.3g}" for key in list(row)[:4]))
+    print("Prop. 1: dimensions, samples, slope to the truth, scatter, offset (predicted)")
+    for row in results["proposition_1"]:
+        print(
+            f"  {row['dimensions']}  {row['samples']:7,d}  {row['slope_to_truth']:.3f}"
+            f"  {row['scatter']:.3f} ({row['scatter_predicted']:.3f})"
+            f"  {row['offset']:.3f} ({row['offset_predicted']:.3f})"
+        )
+
+
+def _row(curve: Mapping[str, Any]) -> str:
+    end = statistics.mean(gap[-1] for gap in curve["gap"])
+    mean, share = curve.get("last_tenth"), curve.get("largest_share_of_bound")
+    return (
+        f"T = {curve['times'][-1]:5d}  {end:9.2e}  {'' if mean is None else f'{mean:9.2e}'}"
+        f"  {'' if share is None else f'{share:.2g}'}"
+    )

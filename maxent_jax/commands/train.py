@@ -1,0 +1,220 @@
+"""Trains a mixture of policies that covers the state space, and leaves its figures.
+
+A run's directory holds config.json, metrics.jsonl (one line an iteration), checkpoints/ and
+figures/. `--resume` goes on from the last complete checkpoint.
+"""
+
+import contextlib
+import dataclasses
+import re
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from maxent_jax import runs
+from maxent_jax.commands import cli
+from maxent_jax.config import Config, preset
+from maxent_jax.runs import locks
+from maxent_jax.runs.sinks import Sinks
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """Train a mixture of policies that covers the state space, with no reward at all."""
+
+    config: Config
+    out: Path | None = None
+    """The run's directory; runs/ENV-METHOD-PRESET-SEED when left out."""
+    resume: bool = False
+    """Go on from the last checkpoint in the run's directory; start over without one. With none of
+    --preset, --env and --method the settings are those of the run."""
+    fallback: bool = False
+    """With --resume: where the last checkpoint is damaged, remove it and take the one before."""
+    overwrite: bool = False
+    """Remove the run that is in the directory, and begin anew."""
+    save_iterations: int = 1
+    """Iterations between checkpoints; the last one is always saved."""
+    save_minutes: float = 10.0
+    """After so many minutes without a checkpoint, save between two segments of an iteration."""
+    tensorboard: bool = False
+    """Write metrics for TensorBoard too, into the run's directory (extra log)."""
+    wandb: str = ""
+    """Send metrics to that project of Weights & Biases too (extra log)."""
+    devices: int = 1
+    """Devices that share the run: seeds first, then environments. 0: all there are."""
+    coordinator: str = ""
+    """HOST:PORT of the first of several processes, or auto under SLURM, Open MPI, Kubernetes and on
+    a TPU slice; see docs/clusters.md."""
+    num_processes: int = 1
+    """Processes of the run, with --coordinator HOST:PORT."""
+    process_id: int = 0
+    """Which of them this is, from 0."""
+
+    @property
+    def directory(self) -> Path:
+        """Where the run lives."""
+        c = self.config
+        return self.out or Path("runs") / f"{c.env}-{c.method}-{c.preset}-{c.seed}"
+
+
+def read_arguments(argv: Sequence[str]) -> Arguments:
+    """The checked arguments.
+
+    Raises:
+      UsageError, ConfigError, RunError: one sentence each.
+    """
+    default = Arguments(_default_config(argv))
+    arguments = cli.parse(Arguments, argv, "train", default=default)
+    _check_saving(arguments)
+    _check_hosts(arguments)
+    Sinks(arguments.tensorboard, arguments.wandb).check()
+    return arguments
+
+
+def _default_config(argv: Sequence[str]) -> Config:
+    """What flags change: a preset, or the settings of the run to be resumed."""
+    values = {name: cli.flag_value(argv, f"--{name}") for name in ("preset", "env", "method")}
+    given = {name: value for name, value in values.items() if value}
+    out = cli.flag_value(argv, "--out")
+    if "--resume" in argv and out and not given and Path(out, runs.CONFIG).exists():
+        return runs.read_config(Path(out))
+    name = given.pop("preset", Config.preset)
+    return preset(name, **given)
+
+
+@contextlib.contextmanager
+def claimed(arguments: Arguments) -> Iterator[None]:
+    """Makes the run's directory, and keeps other processes out of it while inside.
+
+    Raises:
+      BusyError: another process trains in it.
+      UsageError, RunError: see check_free; or it cannot be made.
+    """
+    directory = arguments.directory
+    check_free(arguments)
+    with locks.holding(directory, wait=False):
+        check_free(arguments)  # again: another process may have been here meanwhile
+        if arguments.overwrite:
+            _remove_run(directory)
+        yield
+
+
+def check_free(arguments: Arguments) -> None:
+    """Whether the directory is not there or empty, or holds a run that the arguments deal with.
+
+    Raises:
+      UsageError, RunError: it does not.
+    """
+    directory = arguments.directory
+    taken = directory.is_file() or (
+        directory.is_dir() and not locks.is_free(directory, runs.CONFIG)
+    )
+    if not taken:
+        return
+    if arguments.resume:
+        runs.check_config(directory, arguments.config)
+    elif not arguments.overwrite:
+        raise cli.UsageError(
+            f"{directory} already exists: choose another --out, or add --resume to go on with it "
+            f"or --overwrite to begin anew."
+        )
+    elif not (directory / runs.CONFIG).is_file():
+        raise cli.UsageError(f"{directory} is not the directory of a run: it is left as it is.")
+
+
+def _remove_run(directory: Path) -> None:
+    """All that a run writes, and nothing else."""
+    for name in runs.WRITTEN:
+        path = directory / name
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _check_saving(arguments: Arguments) -> None:
+    for wrong, sentence in (
+        (
+            arguments.save_iterations < 1,
+            f"save-iterations is {arguments.save_iterations}, but must be at least 1.",
+        ),
+        (
+            not arguments.save_minutes > 0,
+            f"save-minutes is {arguments.save_minutes}, but must be a positive number.",
+        ),
+        (
+            arguments.resume and arguments.overwrite,
+            "resume and overwrite exclude each other.",
+        ),
+        (
+            arguments.fallback and not arguments.resume,
+            "fallback needs --resume.",
+        ),
+    ):
+        if wrong:
+            raise cli.UsageError(sentence)
+
+
+def _check_hosts(arguments: Arguments) -> None:
+    coordinator, processes = arguments.coordinator, arguments.num_processes
+    for wrong, sentence in (
+        (
+            arguments.devices < 0,
+            f"devices is {arguments.devices}, but must be 0 (all) or more.",
+        ),
+        (
+            not coordinator and (processes, arguments.process_id) != (1, 0),
+            "num-processes and process-id need --coordinator HOST:PORT.",
+        ),
+        (
+            coordinator not in ("", "auto") and not re.fullmatch(r".+:\d+", coordinator),
+            f"coordinator is '{coordinator}', but must be HOST:PORT, or auto.",
+        ),
+        (
+            processes < 1 or not 0 <= arguments.process_id < processes,
+            f"process-id is {arguments.process_id}, but must be from 0 to below num-processes = "
+            f"{processes}.",
+        ),
+        (
+            coordinator == "auto" and (processes, arguments.process_id) != (1, 0),
+            "num-processes and process-id cannot be chosen with --coordinator auto.",
+        ),
+        (
+            coordinator and arguments.devices > 1,
+            "devices cannot be chosen with --coordinator: all devices of all processes take part.",
+        ),
+    ):
+        if wrong:
+            raise cli.UsageError(sentence)
+
+
+def main(argv: Sequence[str]) -> None:
+    """Parses, checks, and only then loads jax."""
+    started = time.perf_counter()
+    arguments = read_arguments(argv)
+    num_devices = arguments.devices
+    holding: contextlib.AbstractContextManager[None] = claimed(arguments)
+    if arguments.coordinator:
+        from maxent_jax import runtime
+        from maxent_jax.runs import hosts  # loads jax
+
+        runtime.prepare(arguments.config.simulates_in_jax)  # before the first computation
+        hosts.join(arguments.coordinator, arguments.num_processes, arguments.process_id)
+        check_free(arguments)  # by all, so that all end where it is taken
+        hosts.wait_for_all("checked")
+        num_devices = 0
+        if not hosts.is_first():
+            holding = contextlib.nullcontext()
+    with holding:
+        from maxent_jax.runs import driver, hosts  # loads jax
+
+        hosts.wait_for_all("claimed")
+        options = driver.Options(
+            num_devices,
+            arguments.fallback,
+            arguments.save_iterations,
+            arguments.save_minutes,
+            Sinks(arguments.tensorboard, arguments.wandb),
+        )
+        driver.train(arguments.config, arguments.directory, started, options)

@@ -1,0 +1,1 @@
+"""What is shown of a run: its figures, videos, and the tables and page of a report."""
