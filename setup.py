@@ -2,17 +2,23 @@
 
 import copy
 import importlib.util
-import platform
+import sysconfig
 from pathlib import Path
 
 from setuptools import Extension, setup
 from setuptools.command.build_ext import build_ext
 
-# The library is compiled once for each; at run time the first that the processor can run is loaded.
+try:
+    from setuptools.command.bdist_wheel import bdist_wheel
+except ModuleNotFoundError:  # older than pyproject.toml asks for: enough for `build_ext --inplace`
+    bdist_wheel = object
+
+# The library is compiled once for each; at run time the one that the processor can run is loaded.
 X86_64 = {"v4": "-march=x86-64-v4", "v3": "-march=x86-64-v3"}
 ARM64 = {"v8": "-march=armv8-a"}
-MACHINES = {"x86_64": X86_64, "AMD64": X86_64, "aarch64": ARM64, "arm64": ARM64}
-FLAGS = ["-std=c++17", "-O3", "-ffp-contract=fast", "-Wno-psabi", "-Wno-ignored-attributes"]
+MACHINES = {"x86_64": X86_64, "amd64": X86_64, "aarch64": ARM64, "arm64": ARM64}
+FLAGS = ["-std=c++17", "-O3", "-g0", "-ffp-contract=fast", "-Wno-psabi"]
+FLAGS += ["-Wno-ignored-attributes"]
 NATIVE = Path("maxent_jax", "native")
 
 
@@ -26,7 +32,7 @@ def extension(variant: str, architecture: str) -> Extension:
     """The library for one kind of processor."""
     return Extension(
         f"maxent_jax.native._{variant}",
-        [str(NATIVE / name) for name in ("cpu.cc", "knn.cc", "physics.cc")],
+        [str(NATIVE / name) for name in ("knn.cc", "physics.cc")],
         depends=[str(NATIVE / "parallel.h")],
         include_dirs=[str(NATIVE), headers("jaxlib"), headers("mujoco")],
         extra_compile_args=[*FLAGS, architecture],
@@ -42,10 +48,28 @@ class BuildVariants(build_ext):
         own.build_temp = str(Path(self.build_temp, ext.name))
         super(BuildVariants, own).build_extension(ext)
 
+    def get_ext_filename(self, fullname: str) -> str:
+        """Without the tag of a Python version: ctypes loads them, Python does not import them."""
+        return f"{Path(*fullname.split('.'))}.so"
 
-variants = MACHINES.get(platform.machine(), {})
+
+class AnyPython(bdist_wheel):
+    """One wheel for every version of Python: its libraries know nothing of Python."""
+
+    def get_tag(self) -> tuple[str, str, str]:  # noqa: D102
+        return "py3", "none", super().get_tag()[2]
+
+
+machine = sysconfig.get_platform().rsplit("-", 1)[-1].lower()
+variants = MACHINES.get(machine, {})
+which_runs = Extension(
+    "maxent_jax.native._cpu",
+    [str(NATIVE / "cpu.c")],
+    extra_compile_args=["-O2", "-g0"],
+    optional=True,
+)
 setup(
-    cmdclass={"build_ext": BuildVariants},
+    cmdclass={"build_ext": BuildVariants, "bdist_wheel": AnyPython},
     options={"build_ext": {"parallel": True}},
-    ext_modules=[extension(variant, flag) for variant, flag in variants.items()],
+    ext_modules=[which_runs, *(extension(*variant) for variant in variants.items())],
 )

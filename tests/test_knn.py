@@ -2,7 +2,6 @@
 
 import functools
 import itertools
-import shutil
 
 import hypothesis
 import jax
@@ -35,7 +34,6 @@ if native.library():
     FORMS["every point"] = functools.partial(in_cpp, tree=False)
     FORMS["tree"] = functools.partial(in_cpp, tree=True)
 JITTED = {name: jax.jit(form, static_argnums=0) for name, form in FORMS.items()}
-HAS_COMPILER = any(shutil.which(name) for name in ("c++", "g++", "clang++"))
 
 
 @pytest.fixture(params=FORMS)
@@ -269,10 +267,6 @@ def test_a_large_problem_is_solved_exactly():
     queries = points[:: TREE_POINTS // TREE_QUERIES] + np.float32(0.5)
     distance, _ = cKDTree(points.astype(np.float64)).query(queries.astype(np.float64), 3)
     assert_close(jitted(queries, points, 3), distance)
-
-
-def test_the_compiled_search_was_built_where_there_is_a_compiler():
-    assert native.library() or not HAS_COMPILER
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -7,16 +7,20 @@ figures/. `--resume` goes on from the last complete checkpoint.
 import contextlib
 import dataclasses
 import re
+import shlex
 import shutil
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from maxent_jax import runs
-from maxent_jax.commands import cli
+from maxent_jax.commands import COMMANDS, cli
 from maxent_jax.config import Config, preset
-from maxent_jax.runs import locks
+from maxent_jax.runs import display, locks
 from maxent_jax.runs.sinks import Sinks
+
+# By whether jax simulates too; two CPU cores, with AVX-512 and without.
+COMPILING = {False: "15 to 50 s", True: "1 to 3 minutes"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,7 +210,10 @@ def main(argv: Sequence[str]) -> None:
         num_devices = 0
         if not hosts.is_first():
             holding = contextlib.nullcontext()
+    first = arguments.process_id == 0
     with holding:
+        if first:
+            _announce(arguments)
         from maxent_jax.runs import driver, hosts  # loads jax
 
         hosts.wait_for_all("claimed")
@@ -218,3 +225,28 @@ def main(argv: Sequence[str]) -> None:
             Sinks(arguments.tensorboard, arguments.wandb),
         )
         driver.train(arguments.config, arguments.directory, started, options)
+    if first:
+        _point_onward(arguments.directory)
+
+
+def _announce(arguments: Arguments) -> None:
+    """What is about to happen, before the libraries are loaded."""
+    c = arguments.config
+    env_steps = c.num_seeds * c.num_iterations * c.steps_per_iteration
+    seeds = (
+        f"seed {c.seed}" if c.num_seeds == 1 else f"seeds {c.seed} to {c.seed + c.num_seeds - 1}"
+    )
+    display.say(
+        f"{c.method} on {c.env}, preset {c.preset}, {seeds}: {c.num_iterations} iterations, "
+        f"{env_steps:,} environment steps, into {arguments.directory}\n"
+        f"compiling: {COMPILING[c.simulates_in_jax]} the first time, less with a warm cache; "
+        f"Ctrl-C saves the run"
+    )
+
+
+def _point_onward(directory: Path) -> None:
+    """What a user may type next."""
+    what = shlex.quote(str(directory))
+    print("next:")
+    for name in ("evaluate", "render", "report"):
+        print(f"  {cli.spelled(name) + ' ' + what:60} # {COMMANDS[name]}")

@@ -1,30 +1,72 @@
-"""C++ that XLA calls on a CPU, where it was built and can run: the search for nearest neighbours
-(knn.cc) and the physics (physics.cc).
+"""C++ that XLA calls on a CPU: the search for nearest neighbours (knn.cc), physics (physics.cc).
 
-It computes nothing that is not also there without it; it is there because it is faster.
+An optional fast path: results are the same without it. The library is built once for each kind of
+processor. Nothing of a build runs where it cannot: a small library for the oldest processors
+(cpu.c) says which one to load.
 """
 
 import ctypes
 import functools
-import importlib.util
+import logging
+import os
+from pathlib import Path
 
 import jax
 
+from maxent_jax.choices import ConfigError
+
 TARGETS = ("maxent_knn", "maxent_physics")
-VARIANTS = ("v4", "v3", "v8")  # setup.py says what they are; the fastest first
+# Builds, the fastest first, and the processors that run each, as maxent_level numbers them.
+LEVELS = {"v4": (4,), "v3": (3, 4), "v8": (8,)}
+NONE, AUTO = "none", "auto"
+CHOICE = "MAXENT_JAX_NATIVE"  # environment variable: a build's name, none, or auto
+FOLDER = Path(__file__).parent
+
+log = logging.getLogger(__name__)
 
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
-    """The first variant that runs here, its functions known to XLA; None where there is none."""
-    for variant in VARIANTS:
-        found = importlib.util.find_spec(f"maxent_jax.native._{variant}")
-        if found is None or found.origin is None:
-            continue
-        loaded = ctypes.CDLL(found.origin)
-        if loaded.maxent_runs_here():
-            for target in TARGETS:
-                function = jax.ffi.pycapsule(getattr(loaded, target))
-                jax.ffi.register_ffi_target(target, function, platform="cpu")
-            return loaded
-    return None
+    """The build for this processor, its functions known to XLA; None where there is none.
+
+    Raises:
+      ConfigError: MAXENT_JAX_NATIVE names a build that cannot be used here.
+    """
+    name = variant()
+    if name == NONE:
+        return None
+    loaded = ctypes.CDLL(str(path(name)))
+    for target in TARGETS:
+        function = jax.ffi.pycapsule(getattr(loaded, target))
+        jax.ffi.register_ffi_target(target, function, platform="cpu")
+    return loaded
+
+
+@functools.cache
+def variant() -> str:
+    """Which build is used: v4 (x86-64 with AVX-512), v3 (with AVX2), v8 (64-bit Arm), or none.
+
+    Raises:
+      ConfigError: MAXENT_JAX_NATIVE names a build that cannot be used here.
+    """
+    usable = [name for name in LEVELS if path(name).exists() and _level() in LEVELS[name]]
+    wanted = os.environ.get(CHOICE) or AUTO
+    if wanted == AUTO:
+        chosen = usable[0] if usable else NONE
+    elif wanted in (*usable, NONE):
+        chosen = wanted
+    else:
+        here = ", ".join((AUTO, *usable, NONE))
+        raise ConfigError(f"{CHOICE} is '{wanted}', but this machine can use: {here}.")
+    log.debug("native build: %s, of those usable here: %s", chosen, ", ".join(usable) or NONE)
+    return chosen
+
+
+def path(name: str) -> Path:
+    """Where the build of that name lies, if it was made."""
+    return FOLDER / f"_{name}.so"
+
+
+@functools.cache
+def _level() -> int:
+    return ctypes.CDLL(str(path("cpu"))).maxent_level() if path("cpu").exists() else 0

@@ -1,8 +1,9 @@
 // Exact k-nearest-neighbour distances on a CPU, called from XLA. See knn.py for what they mean.
 //
-// Few queries meet every point: 16 queries lie in the SIMD lanes while the points pass by, and a
-// point that is nearer to one of them than the worst of its k so far, which is rare, is inserted.
-// Many queries descend a tree of bounding boxes: points in leaves of 64, 16 nodes below one.
+// Few queries meet every point: a register of queries stays while the points pass by, and a point
+// that is nearer to one of them than the worst of its k so far, which is rare, is inserted.
+// Many queries descend a tree of bounding boxes: points in leaves of 64, a register of nodes below
+// one.
 // Both compute a squared distance by the same operations in the same order, and rounding is
 // monotonic, so that a box is never farther than a point within it: the two agree to the bit.
 
@@ -15,7 +16,7 @@
 #include <numeric>
 #include <vector>
 
-#ifdef __AVX512F__
+#ifdef __AVX2__
 #include <immintrin.h>
 #endif
 
@@ -30,8 +31,14 @@ using maxent::parallel;
 
 #define INLINE inline __attribute__((always_inline))
 
-constexpr int kLanes = 16;       // float32 in an AVX-512 register; narrower machines use several
-constexpr int kLeaf = 64;        // points; four registers share one test
+// Float32 in a register. AVX2 has 16 registers: with 8 lanes, 7 coordinates of the queries and 4
+// partial sums stay in them, with 16 lanes in two registers each they do not.
+#ifdef __AVX512F__
+constexpr int kLanes = 16;
+#else
+constexpr int kLanes = 8;
+#endif
+constexpr int kLeaf = 64;        // points, whose registers share one test
 constexpr int kFanout = kLanes;  // children of a node
 constexpr int kTile = 64;        // queries that one job takes, at most
 constexpr int kChunk = 512;      // points that stay in the first-level cache while a tile passes
@@ -58,16 +65,17 @@ INLINE Lanes smaller(Lanes a, Lanes b) { return a < b ? a : b; }
 
 INLINE Lanes larger(Lanes a, Lanes b) { return a < b ? b : a; }
 
-// Whether any lane of `a` is below its like of `b`: the one test of the inner loops.
-INLINE bool any_below(Lanes a, Lanes b) {
-#ifdef __AVX512F__
-  return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LT_OQ) != 0;
+// The lanes in which `a` is below `b`, a bit each: the one test of the inner loops.
+INLINE uint32_t below(Lanes a, Lanes b) {
+#if defined(__AVX512F__)
+  return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LT_OQ);
+#elif defined(__AVX2__)
+  return _mm256_movemask_ps(_mm256_cmp_ps((__m256)a, (__m256)b, _CMP_LT_OQ));
 #else
-  using Words = int64_t __attribute__((vector_size(sizeof(Lanes))));
-  const Words words = (Words)(a < b);
-  int64_t bits = 0;
-  for (int i = 0; i < kLanes / 2; ++i) bits |= words[i];
-  return bits != 0;
+  const Mask is_below = a < b;
+  uint32_t bits = 0;
+  for (int lane = 0; lane < kLanes; ++lane) bits |= (is_below[lane] & 1u) << lane;
+  return bits;
 #endif
 }
 
@@ -125,9 +133,9 @@ INLINE int64_t pass(const Problem& problem, int64_t from, int64_t to, const floa
     }
     Lanes nearest = squares[0];
     for (int u = 1; u < kUnroll; ++u) nearest = smaller(squares[u], nearest);
-    if (__builtin_expect(!any_below(nearest, worst), 1)) continue;
+    if (__builtin_expect(!below(nearest, worst), 1)) continue;
     for (int u = 0; u < kUnroll; ++u) {
-      if (!any_below(squares[u], worst)) continue;
+      if (!below(squares[u], worst)) continue;
       Lanes square = excluded == problem.labels[m + u] ? all(kInf) : squares[u];
       for (int64_t i = 0; i < k; ++i) {  // what is larger moves on to the next place
         const Lanes kept = load(smallest + i * kLanes);
@@ -184,14 +192,14 @@ void search_all(const Problem& problem, int64_t first, int64_t tile) {
     finish(problem, first + i, &smallest[i / kLanes * k * kLanes + i % kLanes], kLanes);
 }
 
-// Level 0 holds the leaves; 16 neighbours on a level have one parent on the next. All is laid out
-// with 16 points or nodes in the lanes: [groups, F, 16].
+// Level 0 holds the leaves; kFanout neighbours on a level have one parent on the next. All is laid
+// out with points or nodes in the lanes: [groups, F, kLanes].
 struct Tree {
   int64_t num_features = 0;
-  std::vector<float> points;     // [leaves * 4, F, 16]; inf where a leaf is not full
+  std::vector<float> points;     // [groups, F, kLanes]; inf where a leaf is not full
   std::vector<int32_t> labels;   // [leaves * 64]
   std::vector<int64_t> sizes;    // of each level, in nodes
-  std::vector<std::vector<float>> low, high;  // of each level, [groups, F, 16]; empty: low is inf
+  std::vector<std::vector<float>> low, high;  // of each level, [groups, F, kLanes]; empty: low is inf
 };
 
 // Which points lie in which leaf: `order` is permuted until each leaf's are neighbours in it.
@@ -350,13 +358,15 @@ INLINE void search_leaf(const Tree& tree, int64_t leaf, const float* query, int3
     }
   Lanes nearest = squares[0];
   for (int group = 1; group < kGroups; ++group) nearest = smaller(squares[group], nearest);
-  if (!any_below(nearest, all(smallest[k - 1]))) return;
+  if (!below(nearest, all(smallest[k - 1]))) return;
   for (int group = 0; group < kGroups; ++group) {
-    if (!any_below(squares[group], all(smallest[k - 1]))) continue;
-    for (int lane = 0; lane < kLanes; ++lane)
+    uint32_t bits = below(squares[group], all(smallest[k - 1]));
+    for (; bits; bits &= bits - 1) {
+      const int lane = __builtin_ctz(bits);
       if (squares[group][lane] < smallest[k - 1] &&
           exclude != tree.labels[leaf * kLeaf + group * kLanes + lane])
         insert(squares[group][lane], smallest, k);
+    }
   }
 }
 
@@ -376,10 +386,9 @@ INLINE int64_t open_group(const Tree& tree, int32_t level, int64_t group, const 
     outside = outside > 0 ? outside : Lanes{};
     bounds += outside * outside;
   }
-  if (!any_below(bounds, all(worst))) return 0;
   int64_t num = 0;
-  for (int lane = 0; lane < kLanes; ++lane) {
-    if (!(bounds[lane] < worst)) continue;
+  for (uint32_t bits = below(bounds, all(worst)); bits; bits &= bits - 1) {
+    const int lane = __builtin_ctz(bits);
     int64_t place = num++;
     for (; place > 0 && visits[place - 1].bound < bounds[lane]; --place)
       visits[place] = visits[place - 1];

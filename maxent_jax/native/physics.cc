@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <iterator>
 #include <map>
 #include <mutex>
 #include <string>
@@ -35,7 +36,12 @@ struct Field {
   int64_t size;
 };
 
-const std::map<std::string_view, mjtNum* mjData::*> kFields = {
+struct NamedField {
+  std::string_view name;
+  mjtNum* mjData::* values;
+};
+
+constexpr NamedField kFields[] = {
     {"cinert", &mjData::cinert},
     {"cvel", &mjData::cvel},
     {"qfrc_actuator", &mjData::qfrc_actuator},
@@ -102,9 +108,17 @@ class Simulator {
   std::vector<mjData*> idle_;
 };
 
-// Never destroyed: MuJoCo may be gone by then.
-std::mutex& simulators_mutex = *new std::mutex;
-auto& simulators = *new std::map<std::string, Simulator, std::less<>>;
+struct Simulators {
+  std::mutex mutex;
+  std::map<std::string, Simulator, std::less<>> by_name;
+};
+
+// Made when first used, so that loading this library runs none of its code; never destroyed, since
+// MuJoCo may be gone by then.
+Simulators& simulators() {
+  static auto& made = *new Simulators;
+  return made;
+}
 
 ffi::Error step(ffi::ThreadPool pool, Floats qpos, Floats qvel, Floats warmstart, Floats control,
                 std::string_view model, int64_t num_substeps, ffi::Result<Floats> next_qpos,
@@ -112,9 +126,9 @@ ffi::Error step(ffi::ThreadPool pool, Floats qpos, Floats qvel, Floats warmstart
                 ffi::Result<Floats> derived) {
   Simulator* simulator = nullptr;
   {
-    const std::lock_guard<std::mutex> lock(simulators_mutex);
-    const auto found = simulators.find(model);
-    if (found == simulators.end())
+    const std::lock_guard<std::mutex> lock(simulators().mutex);
+    const auto found = simulators().by_name.find(model);
+    if (found == simulators().by_name.end())
       return ffi::Error(ffi::ErrorCode::kNotFound, "the model of a program is not loaded");
     simulator = &found->second;
   }
@@ -145,12 +159,13 @@ extern "C" bool maxent_add_model(const char* name, const mjModel* model, const F
                                  const char* const* derived, const int64_t* sizes, int64_t count) {
   std::vector<Field> fields;
   for (int64_t i = 0; i < count; ++i) {
-    const auto found = kFields.find(derived[i]);
-    if (found == kFields.end()) return false;
-    fields.push_back({found->second, sizes[i]});
+    const auto found = std::find_if(std::begin(kFields), std::end(kFields),
+                                    [&](const NamedField& field) { return field.name == derived[i]; });
+    if (found == std::end(kFields)) return false;
+    fields.push_back({found->values, sizes[i]});
   }
-  const std::lock_guard<std::mutex> lock(simulators_mutex);
-  simulators.try_emplace(name, *functions, model, std::move(fields));
+  const std::lock_guard<std::mutex> lock(simulators().mutex);
+  simulators().by_name.try_emplace(name, *functions, model, std::move(fields));
   return true;
 }
 

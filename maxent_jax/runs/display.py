@@ -1,5 +1,8 @@
-"""Progress on standard error, for terminals alone."""
+"""Progress on standard error: a bar in a terminal, elsewhere a line an iteration."""
 
+import contextlib
+import os
+import sys
 import time
 from collections.abc import Iterable, Sequence
 from typing import Any, TypeVar
@@ -14,18 +17,35 @@ from maxent_jax.config import Config
 Item = TypeVar("Item")
 
 
+def say(sentence: str) -> None:
+    """One line on standard error; a terminal that has gone stops no run."""
+    if sys.stderr is not None:  # closed by the shell: 2>&-
+        with contextlib.suppress(OSError, ValueError):
+            print(sentence, file=sys.stderr, flush=True)
+
+
+def duration(seconds: float) -> str:
+    """As people say it: 45 s, 6 min 42 s, 3 h 20 min."""
+    minutes, left = divmod(round(seconds), 60)
+    if minutes == 0:
+        return f"{left} s"
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {left:02d} s"
+
+
 def track(items: Sequence[Item], what: str) -> Iterable[Item]:
     """The items, with a progress line on standard error where that is a terminal."""
-    console = Console(stderr=True)
+    console = _console()
     return progress.track(items, what, console=console, disable=not console.is_terminal)
 
 
 class Bar:
-    """A progress line on standard error; nothing where that is not a terminal."""
+    """How far a run has come: a bar in a terminal, elsewhere a line at the end of an iteration."""
 
     def __init__(self, config: Config, iteration: int, segments: int, last_row: dict[str, Any]):
         """At that many complete iterations and segments of the next; the last row, if any."""
-        console = Console(stderr=True)
+        console = _console()
+        self._in_terminal = console.is_terminal
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(bar_width=16),
@@ -34,10 +54,11 @@ class Bar:
             TextColumn("left"),
             TimeRemainingColumn(),
             console=console,
-            disable=not console.is_terminal,
+            disable=not self._in_terminal,
         )
         self._config, self._iteration, self._segments = config, iteration, segments
         self._reached, self._rate = _reached(last_row), ""
+        self._trained_here = 0  # segments, by this process
         self._task = self._progress.add_task(
             self._description(),
             total=config.num_iterations * config.num_segments,
@@ -47,7 +68,7 @@ class Bar:
 
     def __enter__(self) -> "Bar":
         self._progress.start()
-        self._last = time.perf_counter()
+        self._compiled = self._last = time.perf_counter()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -58,33 +79,63 @@ class Bar:
         c, now = self._config, time.perf_counter()
         steps = c.num_seeds * c.vector_steps * c.num_envs
         self._rate = f" · {steps / (now - self._last):,.0f} steps/s"
-        self._segments, self._last = self._segments + 1, now
+        self._segments, self._trained_here = self._segments + 1, self._trained_here + 1
+        self._last = now
+        if self._trained_here == 1:
+            self._compiled = now
+        if self._trained_here == 2:
+            self._line(f"compiled{self._left()}")
         self._show()
 
     def iteration_done(self, row: dict[str, Any]) -> None:
         """After the end of an iteration, which may have come before its last segment."""
         self._iteration, self._segments = self._iteration + 1, 0
-        self._reached = _reached(row)
+        self._reached, self._last = _reached(row), time.perf_counter()
         self._show()
-        self._last = time.perf_counter()
+        self._line(
+            f"iteration {self._iteration}/{self._config.num_iterations} · {self._spent()}"
+            f"{self._reached} · {duration(row['wall_seconds'])}{self._left()}"
+        )
+
+    def _left(self) -> str:
+        """An estimate, from all segments of this process but the first, which is compiled."""
+        left = self._config.num_iterations * self._config.num_segments - self._done_segments()
+        if left == 0 or self._trained_here < 2:
+            return ""
+        rate = (self._last - self._compiled) / (self._trained_here - 1)
+        return f", about {duration(left * rate)} left"
+
+    def _line(self, sentence: str) -> None:
+        """Where a bar cannot move."""
+        if not self._in_terminal:
+            say(sentence)
 
     def _description(self) -> str:
         now = min(self._iteration + 1, self._config.num_iterations)
         return f"iteration {now}/{self._config.num_iterations}"
 
+    def _done_segments(self) -> int:
+        return self._iteration * self._config.num_segments + self._segments
+
+    def _spent(self) -> str:
+        c, vector_steps = self._config, self._done_segments() * self._config.vector_steps
+        return (
+            f"{vector_steps * c.num_envs:,} env steps · "
+            f"{vector_steps * c.updates_per_vector_step:,} updates"
+        )
+
     def _show(self) -> None:
-        c = self._config
-        segments = self._iteration * c.num_segments + self._segments
-        vector_steps = segments * c.vector_steps
         self._progress.update(
             self._task,
-            completed=segments,
+            completed=self._done_segments(),
             description=self._description(),
-            status=(
-                f"{vector_steps * c.num_envs:,} env steps · "
-                f"{vector_steps * c.updates_per_vector_step:,} updates{self._rate}{self._reached}"
-            ),
+            status=f"{self._spent()}{self._rate}{self._reached}",
         )
+
+
+def _console() -> Console:
+    """Of standard error or, where that is closed, of nothing."""
+    return Console(stderr=True) if sys.stderr is not None else Console(file=open(os.devnull, "w"))
 
 
 def _reached(row: dict[str, Any]) -> str:

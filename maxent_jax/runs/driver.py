@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import sys
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +13,7 @@ from maxent_jax.runs import hosts
 from maxent_jax.visual import figures
 from maxent_jax.choices import UsageError
 from maxent_jax.runs.clock import Clock
-from maxent_jax.runs.display import Bar
+from maxent_jax.runs.display import Bar, duration, say
 from maxent_jax.runs.interruption import Interrupted, Interruption
 from maxent_jax.runs.sinks import Sinks
 from maxent_jax.runs.stages import Stage, advance, check_finite
@@ -24,6 +23,7 @@ from maxent_jax import (
     devices,
     integrity,
     methods,
+    native,
     parts,
     plotting,
     runs,
@@ -82,7 +82,7 @@ def train(
     hosts.leave()
     if hosts.is_first():
         figures.draw(directory)
-        _summarise(directory, rows)
+        _summarise(config, directory, rows)
 
 
 def _placement(config: Config, num_devices: int) -> State | None:
@@ -117,12 +117,14 @@ def _last_progress(directory: Path, options: Options) -> Progress | None:
     def go_back_to_it() -> None:
         for damaged, sentence in passed_over.items():
             shutil.rmtree(directory / integrity.FOLDER / damaged)
-            _note(f"{sentence[:-1]}; it is removed, and the run goes on from checkpoint {name}.")
+            say(
+                f"note: {sentence[:-1]}; it is removed, and the run goes on from checkpoint {name}."
+            )
         for what, now in (runs.stack() | _machine()).items():
             if computed_with.get(what) != now:
-                _note(
-                    f"{what} was {computed_with.get(what)} and is {now}: from here on the run is "
-                    f"not bit-identical to an undisturbed one."
+                say(
+                    f"note: {what} was {computed_with.get(what)} and is {now}: from here on the run "
+                    f"may not be bit-identical to an undisturbed one."
                 )
         runs.write_metrics(directory, progress.rows)
 
@@ -130,16 +132,13 @@ def _last_progress(directory: Path, options: Options) -> Progress | None:
     return progress
 
 
-def _note(sentence: str) -> None:
-    print(f"note: {sentence}", file=sys.stderr)
-
-
 def _machine() -> dict[str, Any]:
-    """What the bits of a result depend on beside the software."""
+    """What the bits of a result depend on beside the software, the kind of processor included."""
     return {
         "device": jax.devices()[0].device_kind,
         "devices": jax.device_count(),
         "cpu_cores": os.cpu_count(),
+        "native": native.variant(),
     }
 
 
@@ -184,14 +183,15 @@ def _train(
     return progress.rows
 
 
-def _summarise(directory: Path, rows: list[dict[str, Any]]) -> None:
+def _summarise(config: Config, directory: Path, rows: list[dict[str, Any]]) -> None:
     last = rows[-1]
+    cells = parts.make(config).grid.num_cells
     random = ""
     if "random_coverage" in last:
-        random = f" ({np.mean(last['random_coverage']):,.0f} by a random policy)"
+        random = f" (a random policy: {np.mean(last['random_coverage']):,.0f})"
     print(
-        f"{directory}: {np.mean(last['cumulative_coverage']):,.0f} cells visited in training"
-        f"{random}, "
-        f"{np.mean(last['mixture_coverage']):,.0f} by the mixture, "
-        f"{last['wall_seconds']:,.0f} s; figures in {directory / runs.FIGURES}."
+        f"{directory}: training visited {np.mean(last['cumulative_coverage']):,.0f} of {cells:,} "
+        f"cells{random}, the mixture of {config.archive_size} policies "
+        f"{np.mean(last['mixture_coverage']):,.0f}; {duration(last['wall_seconds'])}.\n"
+        f"figures: {directory / runs.FIGURES}/{{{','.join(plotting.NAMES)}}}.png"
     )
