@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parent.parent / "maxent_jax"
+import maxent_jax
+
+PACKAGE = Path(maxent_jax.__file__).parent
 # The reading order of the package, first to last.
 ORDER = [
     *("types", "choices", "presets", "config", "convergence"),
@@ -75,9 +77,9 @@ def test_the_command_line_is_checked_without_jax():
 
 
 def test_no_unsafe_loading_anywhere():
-    root = PACKAGE.parent
-    for folder in ("maxent_jax", "experiments", "benchmarks"):
-        for path in (root / folder).rglob("*.py"):
+    root = Path(__file__).parent.parent
+    for folder in (PACKAGE, root / "experiments", root / "benchmarks"):
+        for path in folder.rglob("*.py"):
             tree = ast.parse(path.read_text())
             names = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)}
             names |= {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}

@@ -49,17 +49,22 @@ def variant() -> str:
     Raises:
       ConfigError: MAXENT_JAX_NATIVE names a build that cannot be used here.
     """
-    usable = [name for name in LEVELS if path(name).exists() and _level() in LEVELS[name]]
+    here = usable()
     wanted = os.environ.get(CHOICE) or AUTO
     if wanted == AUTO:
-        chosen = usable[0] if usable else NONE
-    elif wanted in (*usable, NONE):
+        chosen = (*here, NONE)[0]
+    elif wanted in (*here, NONE):
         chosen = wanted
     else:
-        here = ", ".join((AUTO, *usable, NONE))
-        raise ConfigError(f"{CHOICE} is '{wanted}', but this machine can use: {here}.")
-    log.debug("native build: %s, of those usable here: %s", chosen, ", ".join(usable) or NONE)
+        allowed = ", ".join((AUTO, *here, NONE))
+        raise ConfigError(f"{CHOICE} is '{wanted}', but this machine can use: {allowed}.")
+    log.debug("native build: %s, of those usable here: %s", chosen, ", ".join(here) or NONE)
     return chosen
+
+
+def usable() -> tuple[str, ...]:
+    """The builds that were made and that this processor can run, the fastest first."""
+    return tuple(name for name in LEVELS if path(name).exists() and _level() in LEVELS[name])
 
 
 def path(name: str) -> Path:
