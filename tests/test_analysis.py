@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -24,12 +25,9 @@ NOTEBOOK = ROOT / "docs" / "analysis.ipynb"
 
 
 @pytest.fixture(scope="module")
-def directory(tmp_path_factory):
+def directory(smoke_run, tmp_path_factory):
     """Where the notebook looks for it, seen from a folder beside."""
-    path = tmp_path_factory.mktemp("work") / "runs" / "ant"
-    line = ("experiments.train", "--preset", "smoke", "--out", str(path))
-    subprocess.run([sys.executable, "-m", *line], cwd=ROOT, check=True, capture_output=True)
-    return path
+    return Path(shutil.copytree(smoke_run, tmp_path_factory.mktemp("work") / "runs" / "ant"))
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ import sys
 import time
 from pathlib import Path
 
+import commands
 import pytest
 
 from maxent_jax import integrity, runs
@@ -92,6 +93,7 @@ print("equal")
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env", "num_seeds", "across"),
     [("ant", 1, {"seeds": 1, "envs": 8}), ("pendulum", 4, {"seeds": 4, "envs": 2})],
@@ -130,6 +132,7 @@ def start_two(directory, logs, *flags):
     return processes
 
 
+@pytest.mark.slow
 def test_two_processes_train_one_run_and_end_together(tmp_path):
     directory, logs = tmp_path / "run", tmp_path / "logs"
     processes = start_two(directory, logs)
@@ -149,6 +152,7 @@ def test_two_processes_train_one_run_and_end_together(tmp_path):
     assert (directory / "figures" / "curves.png").exists()
 
 
+@pytest.mark.slow
 def test_two_processes_stop_together_when_one_is_asked_to(tmp_path):
     directory, logs = tmp_path / "run", tmp_path / "logs"
     many = ("--num-iterations", "40", "--mixture-episodes", "41")
@@ -173,14 +177,7 @@ def test_two_processes_stop_together_when_one_is_asked_to(tmp_path):
     ],
 )
 def test_a_share_that_cannot_be_is_one_sentence(tmp_path, flags, message):
-    done = subprocess.run(
-        [sys.executable, "-m", "experiments.train", *SMOKE, "--out", str(tmp_path / "run"), *flags],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 2
+    done = commands.call("train", *SMOKE, "--out", tmp_path / "run", *flags, expect=2)
     assert re.fullmatch(rf"error: .*{message}.*\n", done.stderr), done.stderr
 
 

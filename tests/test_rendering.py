@@ -1,7 +1,6 @@
 """Pictures of states: what is seen moves, the choice of OpenGL, videos and strips, mistakes."""
 
 import dataclasses
-import shutil
 import subprocess
 import sys
 import time
@@ -37,14 +36,6 @@ def opengl():
 def ant(opengl):
     with rendering.scene(parts.make(preset("smoke")), SIZE) as scene:
         yield scene
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    directory = tmp_path_factory.mktemp("runs") / "v"
-    line = ("experiments.train", "--preset", "smoke", "--out", str(directory))
-    subprocess.run([sys.executable, "-m", *line], cwd=ROOT, check=True, capture_output=True)
-    return directory
 
 
 def rest(env="ant", **positions):
@@ -186,8 +177,8 @@ def test_stills_run_from_the_first_step_to_the_last():
     assert film.stills(1, 3) == [0, 0, 0]
 
 
-def test_a_run_is_filmed(opengl, finished, tmp_path, capsys):
-    directory = shutil.copytree(finished, tmp_path / "run")
+def test_a_run_is_filmed(opengl, copy_of_smoke_run, capsys):
+    directory = copy_of_smoke_run
     options = ("--size", SIZE, "--stills", 3, "--speed", 4, "--episodes", 1, "--seed", 3)
     render.main([str(directory), *map(str, options)])
     videos = directory / "videos"
@@ -214,8 +205,8 @@ def size_of(path):
         return image.size
 
 
-def test_one_policy_is_filmed_alone(opengl, finished, tmp_path):
-    directory = shutil.copytree(finished, tmp_path / "run")
+def test_one_policy_is_filmed_alone(opengl, copy_of_smoke_run):
+    directory = copy_of_smoke_run
     render.main([str(directory), "--policy", "2", "--size", "128", "--speed", "50"])
     assert {path.name for path in (directory / "videos").iterdir()} == {
         "policy_2.mp4",

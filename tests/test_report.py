@@ -11,6 +11,7 @@ import time
 from html.parser import HTMLParser
 from pathlib import Path
 
+import commands
 import pytest
 import untrained
 from PIL import Image
@@ -54,8 +55,7 @@ class Page(HTMLParser):
 def directory(tmp_path_factory):
     """Of a run of two seeds, with a strip of stills of the first alone."""
     path = tmp_path_factory.mktemp("runs") / NAME
-    line = ("experiments.train", "--preset", "smoke", "--num-seeds", "2", "--out", str(path))
-    subprocess.run([sys.executable, "-m", *line], cwd=ROOT, check=True, capture_output=True)
+    commands.call("train", "--preset", "smoke", "--num-seeds", "2", "--out", path)
     for i in range(2):
         (path / "videos" / f"seed_{i}").mkdir(parents=True)
     Image.new("RGB", (4, 4)).save(path / "videos" / "seed_0" / "mixture.png")

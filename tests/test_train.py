@@ -11,6 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from commands import ROOT, call
 
 import maxent_jax
 from maxent_jax import envs, integrity, runs
@@ -18,27 +19,17 @@ from maxent_jax.commands import train
 from maxent_jax.config import preset
 from maxent_jax.runs import driver
 
-ROOT = Path(__file__).parent.parent
 TINY = ("--preset", "smoke", "--num-segments", "1", "--mixture-episodes", "6")
 
 
-def command(module, *arguments):
-    return [sys.executable, "-m", module, *map(str, arguments)]
+def benchmark(name, *arguments):
+    line = [sys.executable, "-m", f"benchmarks.{name}", "--toy", *map(str, arguments)]
+    return subprocess.run(line, cwd=ROOT, check=True, capture_output=True, text=True).stdout
 
 
-def call(module, *arguments, expect=0):
-    done = subprocess.run(
-        command(module, *arguments), cwd=ROOT, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == expect, done.stderr
-    return done
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    directory = tmp_path_factory.mktemp("runs") / "v"
-    call("experiments.train", "--preset", "smoke", "--out", directory)
-    return directory
+@pytest.fixture
+def finished(smoke_run):
+    return smoke_run
 
 
 def test_a_run_leaves_its_files(finished):
@@ -88,7 +79,7 @@ def test_a_run_loads_for_analysis(finished):
 
 
 def test_evaluate_reports_each_policy(finished):
-    printed = call("experiments.evaluate", finished, "--episodes", 1).stdout
+    printed = call("evaluate", finished, "--episodes", 1).stdout
     report = json.loads((finished / "evaluation.json").read_text())
     assert len(report["policies"]) == 3
     assert report["training_coverage"] == (maxent_jax.load_run(finished).histogram > 0).sum()
@@ -100,14 +91,14 @@ def test_resuming_a_finished_run_changes_nothing(finished):
         return {p: p.stat().st_mtime_ns for p in finished.rglob("*") if p.is_file()}
 
     before = contents()
-    done = call("experiments.train", "--preset", "smoke", "--out", finished, "--resume")
+    done = call("train", "--preset", "smoke", "--out", finished, "--resume")
     assert "complete" in done.stdout
     assert contents() == before
 
 
 def test_a_run_killed_before_its_figures_gets_them_on_resume(finished):
     (finished / "figures" / "curves.png").unlink()
-    call("experiments.train", "--preset", "smoke", "--out", finished, "--resume")
+    call("train", "--preset", "smoke", "--out", finished, "--resume")
     assert (finished / "figures" / "curves.png").exists()
 
 
@@ -138,7 +129,7 @@ def test_several_seeds_train_side_by_side(tmp_path):
         maxent_jax.load_run(tmp_path, seed_index=2)
 
 
-@pytest.mark.parametrize("backend", ["mujoco", "mjx"])
+@pytest.mark.parametrize("backend", ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("method", "period"), [("h", -1), ("la", 1), ("la", 10), ("la", 0), ("v", -1)]
 )
@@ -204,7 +195,7 @@ def test_an_environment_of_the_users_trains(tmp_path):
 
 
 def test_resume_with_other_settings_names_them(finished):
-    line = ("experiments.train", "--preset", "smoke", "--out", finished, "--resume")
+    line = ("train", "--preset", "smoke", "--out", finished, "--resume")
     done = call(*line, "--learning-rate", "0.5", expect=2)
     assert "learning_rate was 0.0003 and is 0.5" in done.stderr
 
@@ -223,7 +214,7 @@ def test_resume_with_other_settings_names_them(finished):
 def test_evaluate_refuses_a_directory_that_is_no_run(tmp_path, damage):
     runs.write_config(tmp_path, preset("smoke"), {}, {})
     damage(tmp_path)
-    done = call("experiments.evaluate", tmp_path, expect=2)
+    done = call("evaluate", tmp_path, expect=2)
     assert done.stderr.count("\n") == 1 and str(tmp_path) in done.stderr
 
 
@@ -231,24 +222,24 @@ def test_a_damaged_checkpoint_is_named_and_passed_over_on_demand(finished, tmp_p
     directory = tmp_path / "damaged"
     shutil.copytree(finished, directory)
     (directory / "checkpoints" / "2" / "arrays" / "results" / "_METADATA").unlink()
-    done = call("experiments.evaluate", directory, expect=2)
+    done = call("evaluate", directory, expect=2)
     assert "checkpoint 2" in done.stderr and done.stderr.count("\n") == 1
     assert "arrays/results/_METADATA is missing" in done.stderr
-    assert "arrays/results/_METADATA" in call("experiments.verify", directory, expect=1).stdout
+    assert "arrays/results/_METADATA" in call("verify", directory, expect=1).stdout
     with pytest.warns(UserWarning, match="checkpoint 2"):
         assert maxent_jax.load_run(directory, fallback=True).num_policies == 2
-    done = call("experiments.train", "--out", directory, "--resume", "--fallback")
+    done = call("train", "--out", directory, "--resume", "--fallback")
     assert "goes on from checkpoint 1" in done.stderr
     assert maxent_jax.load_run(directory).num_policies == 3
-    assert "damaged" not in call("experiments.verify", directory).stdout
+    assert "damaged" not in call("verify", directory).stdout
 
 
 def test_a_run_resumes_with_its_own_settings_and_is_overwritten_on_demand(finished, tmp_path):
     directory = tmp_path / "run"
     shutil.copytree(finished, directory)
     (directory / "mine.txt").write_text("kept")
-    assert "complete" in call("experiments.train", "--out", directory, "--resume").stdout
-    call("experiments.train", *TINY, "--num-iterations", 1, "--out", directory, "--overwrite")
+    assert "complete" in call("train", "--out", directory, "--resume").stdout
+    call("train", *TINY, "--num-iterations", 1, "--out", directory, "--overwrite")
     assert len(runs.read_metrics(directory)) == 1
     assert (directory / "mine.txt").read_text() == "kept"
 
@@ -263,43 +254,45 @@ def test_another_stack_is_said_to_give_other_bits(finished, tmp_path):
     (checkpoint / "progress.json").write_text(json.dumps(content))
     (checkpoint / integrity.MANIFEST).unlink()
     integrity.seal(checkpoint)
-    done = call("experiments.train", "--out", directory, "--resume")
+    done = call("train", "--out", directory, "--resume")
     assert "jax was 0.0.1" in done.stderr and "may not be bit-identical" in done.stderr
     assert done.stderr.count("\n") == 1
 
 
 def test_a_directory_that_cannot_be_made_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
-    done = call("experiments.train", "--out", tmp_path / "file" / "run", expect=2)
+    done = call("train", "--out", tmp_path / "file" / "run", expect=2)
     assert "cannot write" in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_evaluate_says_when_there_is_no_checkpoint(tmp_path):
     runs.write_config(tmp_path, preset("smoke"), {}, {})
-    assert "no complete checkpoint" in call("experiments.evaluate", tmp_path, expect=2).stderr
+    assert "no complete checkpoint" in call("evaluate", tmp_path, expect=2).stderr
 
 
 TOY = ("knn", "envs", "physics", "sac", "seeds", "forward_velocity", "compile_time", "replay")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", [*TOY, "learning", "faults"])
 def test_a_benchmark_ends_with_json_rows(module):
-    printed = call(f"benchmarks.{module}", "--toy").stdout.splitlines()
+    printed = benchmark(module).splitlines()
     assert printed[0].startswith("# python")
     assert json.loads(printed[-1])["benchmark"] == module
 
 
+@pytest.mark.slow
 def test_a_gpu_session_runs_part_by_part_and_only_once(tmp_path):
     folders = ("--out", tmp_path / "results", "--work", tmp_path / "work")
     parts = ("--part", "envs", "train")  # the others are benchmarks that run above
-    first = call("benchmarks.gpu_session", "--toy", *parts, *folders).stdout
+    first = benchmark("gpu_session", *parts, *folders)
     assert first.count("exit 0") == 4
     ran = json.loads((tmp_path / "results" / "envs_ant.json").read_text())
     assert ran["rows"][-1]["benchmark"] == "envs"
     paths = np.load(tmp_path / "results" / "ant_states.npz")
     assert paths["seed_1_states"].shape[:1] == paths["seed_1_policy"].shape == (3,)
     assert (tmp_path / "results" / "ant_curves.png").stat().st_size > 0
-    assert call("benchmarks.gpu_session", "--toy", *parts, *folders).stdout == ""
+    assert benchmark("gpu_session", *parts, *folders) == ""
 
 
 def test_an_iteration_ends_at_a_plateau(tmp_path):
