@@ -15,7 +15,7 @@ from maxent_jax import runtime
 # passes. Subprocesses inherit it. With another level in XLA_FLAGS, as in .ci/run, that one is used.
 UNOPTIMISED = "--xla_backend_optimization_level"
 if UNOPTIMISED not in os.environ.get("XLA_FLAGS", ""):
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {UNOPTIMISED}=0".strip()
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {UNOPTIMISED}=1".strip()
 os.environ.setdefault("MPLBACKEND", "Agg")
 runtime.prepare(simulates_in_jax=True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -47,15 +47,26 @@ def forget_programs():
 
 @pytest.fixture(scope="session")
 def smoke_run(tmp_path_factory):
-    """A finished run of preset smoke on Ant, trained once for all workers: copy it to change it."""
+    """A finished run of preset smoke on Ant: copy it to change it."""
+    return _trained_once(tmp_path_factory, "smoke_run")
+
+
+@pytest.fixture(scope="session")
+def two_seeds(tmp_path_factory):
+    """The same with two seeds side by side."""
+    return _trained_once(tmp_path_factory, "two_seeds", "--num-seeds", "2")
+
+
+def _trained_once(tmp_path_factory, name, *flags):
+    """By the first worker that needs it, for all of them."""
     shared = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
         shared = shared.parent
-    directory = shared / "smoke_run"
-    with filelock.FileLock(shared / "smoke_run.lock"):
+    directory, unfinished = shared / name, shared / f"unfinished_{name}"
+    with filelock.FileLock(shared / f"{name}.lock"):
         if not directory.exists():
-            commands.in_subprocess("train", "--preset", "smoke", "--out", shared / "unfinished")
-            (shared / "unfinished").rename(directory)
+            commands.in_subprocess("train", "--preset", "smoke", "--out", unfinished, *flags)
+            unfinished.rename(directory)
     return directory
 
 

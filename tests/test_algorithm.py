@@ -45,6 +45,7 @@ def leaves_equal(a, b):
     return all(np.array_equal(x, y) for x, y in zip(*map(jax.tree.leaves, (a, b)), strict=True))
 
 
+@pytest.mark.slow
 def test_iterate_is_traced_once_in_a_run_of_five_iterations(monkeypatch):
     calls = []
     traced = algorithm.iterate
@@ -59,6 +60,7 @@ def test_iterate_is_traced_once_in_a_run_of_five_iterations(monkeypatch):
     assert (np.diff(metrics["cumulative_coverage"]) >= 0).all()
 
 
+@pytest.mark.slow
 def test_two_seeds_by_vmap_equal_two_single_runs():
     # 5 steps of 2 envs with 1 update each. Episodes of 10 steps: contacts amplify the last bits
     # in which a batched program differs, so that longer ones could not agree to 1e-4.

@@ -125,6 +125,7 @@ def test_distances_of_ends_are_taken_from_each_start(run):
     np.testing.assert_allclose(distances, [5, 0.5, 6])
 
 
+@pytest.mark.slow
 def test_evaluate_measures_the_gap_to_gymnasium(run, directory, capsys):
     evaluate.main([str(directory), "--episodes", "1", "--gymnasium"])
     printed = capsys.readouterr().out
@@ -143,6 +144,7 @@ def test_evaluate_says_where_gymnasium_has_no_such_environment(tmp_path):
         evaluate.main([str(tmp_path), "--gymnasium"])
 
 
+@pytest.mark.slow
 def test_the_notebook_runs(directory):
     notebook = nbformat.read(NOTEBOOK, as_version=4)
     folder = directory.parent.parent / "docs"

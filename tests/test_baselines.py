@@ -51,7 +51,16 @@ def visited(p, state):
     return Occupancy(states, p.phi(states), nobody, one, one > 0, nobody, nobody[0])
 
 
-@pytest.mark.parametrize("method", [*BASELINES, "h-official"])
+QUICK = ("rnd", "apt")  # one that learns a model, one that measures distances
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        pytest.param(method, marks=() if method in QUICK else pytest.mark.slow)
+        for method in (*BASELINES, "h-official")
+    ],
+)
 def test_a_bonus_pays_and_learns_within_training(method):
     config, before, after, metrics = trained(method)
     assert config.bonus == ("histogram" if method == "h-official" else method)
@@ -85,6 +94,7 @@ def test_a_baseline_goes_on_from_where_it_was_and_is_its_last_policy():
     np.testing.assert_array_equal(method.weights, np.eye(config.archive_size))
 
 
+@pytest.mark.slow
 def test_an_episode_forgets_the_one_before_it():
     config = config_of("ngu", episode_length=5, reference_size=32)
     p, state = parts.make(config), algorithm.start(config)
@@ -149,6 +159,7 @@ def test_a_bonus_is_shown_what_was_drawn_and_pays_before_it_learns(what):
     assert int(bonus) == learned + 2 * 16
 
 
+@pytest.mark.slow
 def test_stale_rewards_stay_as_they_were_paid():
     fresh, stale = (config_of("v", stale_rewards=value) for value in (False, True))
     found = []

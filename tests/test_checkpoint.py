@@ -44,6 +44,7 @@ class StopAt(Interruption):
         return 15 if self.boundaries == 0 else None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "period"), [("h", -1), ("la", 10), ("v", -1)])
 def test_a_run_stopped_anywhere_ends_as_one_that_was_not(tmp_path, monkeypatch, method, period):
     config = preset("smoke", env="pendulum", method=method, refresh_period=period, num_seeds=2)

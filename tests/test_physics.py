@@ -100,7 +100,7 @@ EULER = NEWTON._replace(integrator="Euler")  # which compiles in a third of the 
 BOUNDS = [
     ("mjx", "ant", NEWTON, 1e-6, 1e-4),
     ("mjx", "walker2d", EULER, 1e-5, 1e-3),
-    ("mjx", "humanoid", EULER, 1e-5, 1e-4),
+    pytest.param("mjx", "humanoid", EULER, 1e-5, 1e-4, marks=pytest.mark.slow),
     pytest.param("mjx", "walker2d", NEWTON, 1e-5, 1e-3, marks=pytest.mark.slow),
     pytest.param("mjx", "humanoid", NEWTON, 1e-5, 1e-4, marks=pytest.mark.slow),
     pytest.param("warp", "ant", NEWTON, 1e-6, 0.3, marks=pytest.mark.warp),

@@ -427,6 +427,7 @@ def test_fig2_is_what_a_solver_of_quadratic_programs_finds(tmp_path):
     assert (tmp_path / "fig2" / "fig2.png").exists()
 
 
+@pytest.mark.slow
 def test_mepol_has_the_env_steps_of_the_study_and_is_computed_once(tmp_path, monkeypatch):
     from maxent_jax.studies import mepol_rows
 
@@ -442,6 +443,7 @@ def test_mepol_has_the_env_steps_of_the_study_and_is_computed_once(tmp_path, mon
         mepol_rows.rows(tmp_path, config, 1)
 
 
+@pytest.mark.slow
 def test_the_weights_of_the_classic_environments_are_computed_once(tmp_path, monkeypatch):
     from maxent_jax.studies import classic_weights
 

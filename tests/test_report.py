@@ -11,7 +11,6 @@ import time
 from html.parser import HTMLParser
 from pathlib import Path
 
-import commands
 import pytest
 import untrained
 from PIL import Image
@@ -52,10 +51,9 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def directory(tmp_path_factory):
+def directory(two_seeds, tmp_path_factory):
     """Of a run of two seeds, with a strip of stills of the first alone."""
-    path = tmp_path_factory.mktemp("runs") / NAME
-    commands.call("train", "--preset", "smoke", "--num-seeds", "2", "--out", path)
+    path = Path(shutil.copytree(two_seeds, tmp_path_factory.mktemp("runs") / NAME))
     for i in range(2):
         (path / "videos" / f"seed_{i}").mkdir(parents=True)
     Image.new("RGB", (4, 4)).save(path / "videos" / "seed_0" / "mixture.png")

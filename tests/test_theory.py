@@ -305,6 +305,7 @@ def test_bad_input_is_one_sentence(call, sentence):
         call()
 
 
+@pytest.mark.slow
 def test_the_entry_point_at_toy_size(tmp_path, capsys):
     theory.main(["--toy", "--out", str(tmp_path / "results" / "theory.json")])
     results = json.loads((tmp_path / "results" / "theory.json").read_text())

@@ -107,6 +107,7 @@ def test_a_run_can_be_looked_at_with_any_number_of_episodes(finished):
     assert np.bincount(visited.episode_policy).tolist() == [1, 1, 1]
 
 
+@pytest.mark.slow
 def test_resume_without_a_checkpoint_starts_over(tmp_path):
     config = preset("smoke")
     runs.write_config(tmp_path, config, {}, {})
@@ -117,16 +118,14 @@ def test_resume_without_a_checkpoint_starts_over(tmp_path):
     assert [row["env_steps"] for row in runs.read_metrics(tmp_path)] == [400, 800]
 
 
-def test_several_seeds_train_side_by_side(tmp_path):
-    config = preset("smoke", num_iterations=1, num_segments=1, num_seeds=2)
-    driver.train(config, tmp_path, time.perf_counter())
-    (row,) = runs.read_metrics(tmp_path)
-    assert row["env_steps"] == [400, 400]
-    loaded = [maxent_jax.load_run(tmp_path, seed_index=i) for i in range(2)]
-    assert [run.histogram.sum() for run in loaded] == [400, 400]
+def test_several_seeds_train_side_by_side(two_seeds):
+    rows = runs.read_metrics(two_seeds)
+    assert [row["env_steps"] for row in rows] == [[400, 400], [800, 800]]
+    loaded = [maxent_jax.load_run(two_seeds, seed_index=i) for i in range(2)]
+    assert [run.histogram.sum() for run in loaded] == [800, 800]
     assert not np.array_equal(loaded[0].histogram, loaded[1].histogram)
     with pytest.raises(runs.RunError, match="2 seeds"):
-        maxent_jax.load_run(tmp_path, seed_index=2)
+        maxent_jax.load_run(two_seeds, seed_index=2)
 
 
 @pytest.mark.parametrize("backend", ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)])
@@ -157,7 +156,7 @@ def run_smoke(directory, env, backend, **changes):
     assert (directory / "figures" / "fireworks.png").exists()
 
 
-@pytest.mark.parametrize("env", ["humanoid", "pendulum"])
+@pytest.mark.parametrize("env", [pytest.param("humanoid", marks=pytest.mark.slow), "pendulum"])
 def test_every_environment_runs(tmp_path, env):
     run_smoke(tmp_path, env, "auto")
 
@@ -234,6 +233,7 @@ def test_a_damaged_checkpoint_is_named_and_passed_over_on_demand(finished, tmp_p
     assert "damaged" not in call("verify", directory).stdout
 
 
+@pytest.mark.slow
 def test_a_run_resumes_with_its_own_settings_and_is_overwritten_on_demand(finished, tmp_path):
     directory = tmp_path / "run"
     shutil.copytree(finished, directory)
@@ -295,6 +295,7 @@ def test_a_gpu_session_runs_part_by_part_and_only_once(tmp_path):
     assert benchmark("gpu_session", *parts, *folders) == ""
 
 
+@pytest.mark.slow
 def test_an_iteration_ends_at_a_plateau(tmp_path):
     config = preset(
         "smoke",
