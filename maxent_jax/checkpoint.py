@@ -94,7 +94,7 @@ def save(run_directory: Path, state: State, progress: Progress, machine: dict[st
 def read_progress(run_directory: Path, name: str) -> tuple[Progress, dict[str, Any]]:
     """What that checkpoint's run had measured, and what it was computed with."""
     folder = run_directory / FOLDER / name
-    content = json.loads((folder / PROGRESS).read_text())
+    content = json.loads((folder / PROGRESS).read_text(encoding="utf-8"))
     begun, segments = None, []
     if content["begun"]:
         with np.load(folder / PARTIAL) as arrays:

@@ -65,7 +65,7 @@ def make_feature_map(env_name: str) -> Features:
     path = resources.files("maxent_jax") / "tables" / f"features_{env_name}.json"
     if not path.is_file():
         return _default(observation_size(envs.make(env_name)))
-    table = json.loads(path.read_text())
+    table = json.loads(path.read_text(encoding="utf-8"))
     return FeatureMap(
         coordinates=tuple(table["coordinates"]),
         units=tuple(table["units"]),

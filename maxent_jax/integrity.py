@@ -81,7 +81,7 @@ def seal(folder: Path) -> None:
     names = sorted(_names(folder))
     sums = "".join(f"{checksum(folder / name, to_disk=True)}  {name}\n" for name in names)
     manifest = folder / MANIFEST
-    manifest.write_text(f"{sums}# {checksum_of(sums)}\n")
+    manifest.write_text(f"{sums}# {checksum_of(sums)}\n", encoding="utf-8")
     checksum(manifest, to_disk=True)
 
 

@@ -118,12 +118,14 @@ def _places(folder: Path) -> dict[str, Path]:
     places = {name: folder / name for name in names}
     for name in names[1:]:
         places[name].mkdir()
-    (places["foreign"] / "thesis.tex").write_text("")
-    (places["newer"] / runs.CONFIG).write_text(json.dumps({"schema": 99, "config": {}}))
+    (places["foreign"] / "thesis.tex").write_text("", encoding="utf-8")
+    (places["newer"] / runs.CONFIG).write_text(
+        json.dumps({"schema": 99, "config": {}}), encoding="utf-8"
+    )
     runs.write_config(places["run"], preset("smoke"), {}, {})
     runs.write_config(places["pendulum"], preset("smoke", env="pendulum"), {}, {})
     places["file"] = folder / "file"
-    places["file"].write_text("")
+    places["file"].write_text("", encoding="utf-8")
     return places
 
 

@@ -55,7 +55,7 @@ def same(one: Path, other: Path) -> bool:
 
 def timeless(directory: Path) -> list[dict[str, Any]]:
     """The lines of metrics.jsonl without what the clock has a part in."""
-    lines = (directory / runs.METRICS).read_text().splitlines()
+    lines = (directory / runs.METRICS).read_text(encoding="utf-8").splitlines()
     assert len(lines) == len(runs.read_metrics(directory)), "an unfinished line"
     rows = runs.read_metrics(directory)
     return [{k: v for k, v in row.items() if not k.startswith("wall_")} for row in rows]

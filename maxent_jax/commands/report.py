@@ -116,7 +116,7 @@ def _run_section(name: str, seeds: Sequence["Run"]) -> dict[str, Any]:
     from maxent_jax.visual import tables
 
     config = seeds[0].config
-    content = json.loads((seeds[0].path / runs.CONFIG).read_text())
+    content = json.loads((seeds[0].path / runs.CONFIG).read_text(encoding="utf-8"))
     return {
         "name": name,
         "config": config,
