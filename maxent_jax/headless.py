@@ -15,6 +15,9 @@ PACKAGES = "libegl1 and libgl1 (egl), or libosmesa6 (osmesa)"  # Debian's and Ub
 READS_VARIABLE = "mujoco.rendering.classic.gl_context"  # once, when MuJoCo is loaded
 PROBE = """
 import mujoco
+log = mujoco.MjLogConfig.get()
+log.logto_file = False  # see envs.physics.keep_no_log
+mujoco.MjLogConfig.set(log)
 with mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8) as renderer:
     renderer.render()
 """
