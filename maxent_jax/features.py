@@ -30,7 +30,16 @@ class FeatureMap:
     names: tuple[str, ...]
 
     def __call__(self, observation: jax.Array) -> jax.Array:
-        """[..., D] -> [..., F]."""
+        """[..., D] -> [..., F].
+
+        Raises:
+          ValueError: another D than that of the environment.
+        """
+        size = len(self.coordinates) + len(self.projection)
+        if self.projection and jnp.shape(observation)[-1:] != (size,):
+            raise ValueError(
+                f"states have shape {jnp.shape(observation)}, but must be [..., {size}]"
+            )
         kept = observation[..., list(self.coordinates)]
         kept = kept / jnp.broadcast_to(jnp.array(self.units), kept.shape)
         if not self.projection:

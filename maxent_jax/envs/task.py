@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 from brax.envs.base import Env, State
 
-from maxent_jax.choices import BACKENDS, PHYSICS, ConfigError, check_choice
+from maxent_jax.choices import BACKENDS, PHYSICS, ConfigError, check_choice, check_number
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import mjx_backend, mujoco_backend, physics
 from maxent_jax.envs.physics import Derived, Options, PhysicsState
@@ -46,7 +46,8 @@ class MujocoEnv(Env):
       end_flipped: also end an episode once the torso is upside down. Departs from Gymnasium.
       end_unhealthy: end an episode where health fails, as Gymnasium does.
     Raises:
-      ConfigError: an unknown backend or profile, or one that cannot run the task here.
+      ConfigError: an unknown backend or profile, or one that cannot run the task here; a torque
+        limit outside (0, 1].
     """
 
     def __init__(
@@ -60,6 +61,8 @@ class MujocoEnv(Env):
     ):
         self.task = task
         self._backend = resolve_backend(backend)
+        if not 0 < check_number("torque_limit", torque_limit) <= 1:
+            raise ConfigError(f"torque_limit is {torque_limit}, but must be in (0, 1].")
         options = _options(task, profile)
         self.model = physics.load_model(task.xml, options)
         """The simulated model, MuJoCo's own."""
