@@ -71,6 +71,16 @@ def _init(config: Config, method: methods.Method, key: jax.Array) -> State:
     return State(key, jnp.zeros((), jnp.int32), method, archive, learner)
 
 
+def shapes(config: Config) -> State:
+    """The shape and dtype of every leaf of a seed's first state; nothing is computed."""
+    table = jax.ShapeDtypeStruct((config.archive_size, config.archive_size), jnp.float32)
+    number = jax.ShapeDtypeStruct((), jnp.int32)
+    flag = jax.ShapeDtypeStruct((), jnp.bool_)
+    method = methods.Method(table, number, flag, number)  # type: ignore[arg-type]
+    key = jax.eval_shape(jax.random.key, 0)
+    return jax.eval_shape(functools.partial(_init, config.program()), method, key)
+
+
 def begin(config: Config, state: State) -> tuple[State, Metrics]:
     """Steps 1 to 3 of Algorithm 1, and the start of step 4."""
     p = parts.make(config)

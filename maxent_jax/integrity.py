@@ -61,7 +61,10 @@ def find(
         passed_over[name] = f"{sentence}."
     if passed_over:
         raise CheckpointCorruptError(f"{sentence}, and none before it is intact.")
-    raise CheckpointError(f"{run_directory} holds no complete checkpoint.")
+    raise CheckpointError(
+        f"{run_directory} holds no complete checkpoint: its run has not saved one yet; train it, "
+        f"with --resume if it is not running."
+    )
 
 
 def damages(run_directory: Path, name: str, whole: bool = True) -> Iterator[str]:

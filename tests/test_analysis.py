@@ -107,7 +107,7 @@ def test_an_exported_policy_acts_without_this_package(run, visited, tmp_path):
 
 
 def test_no_such_policy_is_exported(run):
-    with pytest.raises(IndexError, match="policy 3 of a mixture of 3"):
+    with pytest.raises(IndexError, match="policy is 3, but the mixture has 3"):
         run.export_policy(3)
 
 

@@ -355,7 +355,7 @@ def test_the_exit_code_of_a_mistake_is_2_and_jax_is_not_loaded_for_it():
     code = (
         "import sys; from maxent_jax.commands import theory\n"
         "sys.argv = ['theory', '--tolerance', '-1']\n"
-        "try: theory.cli.entry_point(theory.main)()\n"
+        "try: theory.cli.entry_point(theory.main)(sys.argv[1:])\n"
         "except SystemExit as stop: sys.exit(10 * ('jax' in sys.modules) + stop.code)"
     )
     ended = subprocess.run(

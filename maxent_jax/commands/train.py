@@ -12,10 +12,11 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from maxent_jax import runs
+from maxent_jax import integrity, runs, runtime
 from maxent_jax.commands import cli
 from maxent_jax.config import Config, preset
 from maxent_jax.runs import locks
+from maxent_jax.runs.sinks import FOLDERS as SINKS
 from maxent_jax.runs.sinks import Sinks
 
 
@@ -101,17 +102,17 @@ def claimed(arguments: Arguments) -> Iterator[None]:
 
 
 def check_free(arguments: Arguments) -> None:
-    """Whether the directory is not there or empty, or holds a run that the arguments deal with.
+    """Whether the directory is not there or nobody's, or holds a run that the arguments deal with.
 
     Raises:
       UsageError, RunError: it does not.
     """
     directory = arguments.directory
-    taken = directory.is_file() or (
-        directory.is_dir() and not locks.is_free(directory, runs.CONFIG)
-    )
-    if not taken:
-        return
+    try:
+        if not directory.exists() or (directory.is_dir() and _is_nobodys(directory)):
+            return
+    except OSError as error:
+        raise cli.UsageError(f"cannot write to {directory}: {error.strerror}.") from None
     if arguments.resume:
         runs.check_config(directory, arguments.config)
     elif not arguments.overwrite:
@@ -121,6 +122,30 @@ def check_free(arguments: Arguments) -> None:
         )
     elif not (directory / runs.CONFIG).is_file():
         raise cli.UsageError(f"{directory} is not the directory of a run: it is left as it is.")
+
+
+def _is_nobodys(directory: Path) -> bool:
+    """Whether it holds no more than what a run leaves that ended before its first checkpoint."""
+    if integrity.checkpoints(directory):
+        return False
+    return all(_is_of_a_beginning(path) for path in directory.iterdir())
+
+
+def _is_of_a_beginning(path: Path) -> bool:
+    directory = path.parent
+    if path.name == runs.CONFIG and path.is_file():
+        return runs.is_config(path)
+    if path.name == runs.METRICS:
+        return path.is_file() and path.stat().st_size == 0
+    if path.name == integrity.FOLDER:
+        unfinished = path.is_dir() and all(
+            inside.name.startswith(integrity.UNFINISHED) for inside in path.iterdir()
+        )
+        return unfinished and not path.is_symlink()
+    temporary = {runs.temporary_of(directory / name).name for name in (runs.CONFIG, runs.METRICS)}
+    if path.name in SINKS:
+        return (directory / runs.CONFIG).is_file()
+    return path.name in {locks.LOCK, *temporary}
 
 
 def _remove_run(directory: Path) -> None:
@@ -193,28 +218,27 @@ def main(argv: Sequence[str]) -> None:
     """Parses, checks, and only then loads jax."""
     started = time.perf_counter()
     arguments = read_arguments(argv)
-    num_devices = arguments.devices
+    config, num_devices = arguments.config, arguments.devices
+    check_free(arguments)
+    runtime.prepare(config.simulates_in_jax)
+    from maxent_jax.runs import driver, hosts  # loads jax
+
     holding: contextlib.AbstractContextManager[None] = claimed(arguments)
     if arguments.coordinator:
-        from maxent_jax import runtime
-        from maxent_jax.runs import hosts  # loads jax
-
-        runtime.prepare(arguments.config.simulates_in_jax)  # before the first computation
         hosts.join(arguments.coordinator, arguments.num_processes, arguments.process_id)
         check_free(arguments)  # by all, so that all end where it is taken
         hosts.wait_for_all("checked")
         num_devices = 0
         if not hosts.is_first():
             holding = contextlib.nullcontext()
+    options = driver.Options(
+        num_devices,
+        arguments.fallback,
+        arguments.save_iterations,
+        arguments.save_minutes,
+        Sinks(arguments.tensorboard, arguments.wandb),
+    )
+    driver.check(config, options)  # before there is a directory
     with holding:
-        from maxent_jax.runs import driver, hosts  # loads jax
-
         hosts.wait_for_all("claimed")
-        options = driver.Options(
-            num_devices,
-            arguments.fallback,
-            arguments.save_iterations,
-            arguments.save_minutes,
-            Sinks(arguments.tensorboard, arguments.wandb),
-        )
-        driver.train(arguments.config, arguments.directory, started, options)
+        driver.train(config, arguments.directory, started, options)

@@ -29,7 +29,7 @@ def main(argv: Sequence[str]) -> None:
     runs.read_config(directory)
     names = integrity.checkpoints(directory)
     if not names:
-        raise runs.CheckpointError(f"{directory} holds no complete checkpoint.")
+        integrity.find(directory)
     if not verify(directory, names):
         sys.exit(1)
 

@@ -100,6 +100,15 @@ def read_config(directory: Path) -> Config:
         raise RunError(f"{path} does not fit this release: {error}") from None
 
 
+def is_config(path: Path) -> bool:
+    """Whether a run may have written that file: of any schema, or empty since the machine failed."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        return not text or {"schema", "config"} <= json.loads(text).keys()
+    except (OSError, ValueError, AttributeError):
+        return False
+
+
 def check_config(directory: Path, config: Config) -> None:
     """Whether the run there has these settings, by whatever preset.
 

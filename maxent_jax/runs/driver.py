@@ -23,6 +23,7 @@ from maxent_jax import (
     checkpoint,
     devices,
     integrity,
+    memory,
     methods,
     parts,
     plotting,
@@ -47,6 +48,16 @@ class Options(NamedTuple):
 AS_USUAL = Options()
 
 
+def check(config: Config, options: Options = AS_USUAL) -> None:
+    """Refuses what cannot run here, before anything is compiled or written.
+
+    Raises:
+      UsageError, ConfigError: no such device, no such share of devices, or too little memory.
+    """
+    runtime.check_devices()
+    memory.check(config, _chosen(options.num_devices))
+
+
 def train(
     config: Config, directory: Path, process_started: float, options: Options = AS_USUAL
 ) -> None:
@@ -56,13 +67,14 @@ def train(
       directory: exists; empty, or with this very run in it.
       process_started: time.perf_counter() when the program began, for the time to the first step.
     Raises:
-      UsageError, ConfigError: no such share of devices.
+      UsageError, ConfigError: see `check`.
       CheckpointCorruptError: the last checkpoint is damaged.
       SaveError: something cannot be written.
       NonFiniteError: training left the finite numbers.
       Interrupted: a signal came, and the run is saved.
     """
     runtime.prepare(config.simulates_in_jax)
+    check(config, options)
     placed = _placement(config, options.num_devices)
     hosts.first_alone(lambda: integrity.clear_unfinished(directory), "clear")
     progress = _last_progress(directory, options)
@@ -85,12 +97,17 @@ def train(
         _summarise(directory, rows)
 
 
-def _placement(config: Config, num_devices: int) -> State | None:
-    """Of the state on that many devices, 0 for all; None for one."""
+def _chosen(num_devices: int) -> list[jax.Device]:
+    """That many devices, 0 for all."""
     available = jax.devices()
     if num_devices > len(available):
         raise UsageError(f"devices is {num_devices}, but there are {len(available)}.")
-    chosen = available[: num_devices or None]
+    return available[: num_devices or None]
+
+
+def _placement(config: Config, num_devices: int) -> State | None:
+    """Of the state on that many devices, 0 for all; None for one."""
+    chosen = _chosen(num_devices)
     if len(chosen) == 1:
         return None
     return devices.placement(config, devices.make_mesh(config, chosen))
