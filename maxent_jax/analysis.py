@@ -30,6 +30,7 @@ from maxent_jax.density import histogram
 from maxent_jax.mixture import Archive
 from maxent_jax.occupancy import Occupancy, Scores
 from maxent_jax.parts import Parts
+from maxent_jax.precision import in_32_bits
 from maxent_jax.sac import agent
 
 if TYPE_CHECKING:
@@ -98,6 +99,7 @@ class Run:
             raise ImportError("Run.frame needs pandas: pip install pandas.") from None
         return DataFrame(_scalar_columns(self.metrics))
 
+    @in_32_bits
     def features(self, states: jax.Array | np.ndarray) -> jax.Array:
         """phi(s), where distances are taken: [..., D] -> [..., F]. `parts.phi.names` names them."""
         return self.parts.phi(jnp.asarray(states))
@@ -111,6 +113,7 @@ class Run:
         """
         return functools.partial(_act, self.parts, self._actor(index))
 
+    @in_32_bits
     def act(self, s: jax.Array, key: jax.Array, policy: int | None = None) -> jax.Array:
         """Actions [..., A] for states [..., D] by one policy, drawn by weight unless named.
 
@@ -129,6 +132,7 @@ class Run:
         """
         return export.policy(self.parts.sac, self._actor(index), deterministic)
 
+    @in_32_bits
     def occupancy(self, episodes_per_policy: int = 5, seed: int = 0) -> Occupancy:
         """Fresh episodes of each policy, with each state's share of the mixture's occupancy.
 
@@ -144,6 +148,7 @@ class Run:
         weights = jnp.asarray(self.weights)
         return _of_mixture(by_policy, self.mixture, weights, starts, key_play)
 
+    @in_32_bits
     def occupancy_of(self, episodes: Paths) -> Occupancy:
         """The same of episodes that were played elsewhere, at least one of each policy.
 
@@ -166,6 +171,7 @@ class Run:
         """Fresh episodes of each policy, as paths."""
         return paths(self.occupancy(episodes_per_policy, seed))
 
+    @in_32_bits
     def dataset(self, n: int, seed: int = 0) -> dict[str, np.ndarray]:
         """`n` transitions of fresh episodes of the mixture, for offline reinforcement learning.
 
@@ -178,6 +184,7 @@ class Run:
         weights, key = jnp.asarray(self.weights), jax.random.key(seed)
         return dataset.collect(self.parts, self.mixture, weights, n, key)
 
+    @in_32_bits
     def scores(self, visited: Occupancy, seed: int = 0) -> Scores:
         """Each policy's return under the reward that these states of the mixture define."""
         rows = mixture.draw_rows(visited.weight, self.config.reference_size, jax.random.key(seed))
@@ -199,6 +206,7 @@ class Run:
             for i in range(self.num_policies)
         ]
 
+    @in_32_bits
     def measures(self, visited: Occupancy, seed: int = 0) -> dict[str, float]:
         """Coverage and entropies of the mixture, named as in the metrics."""
         measured = occupancy.measures(self.parts, visited, jax.random.key(seed))
@@ -219,6 +227,7 @@ class Run:
         return mixture.policy(self.mixture, jnp.asarray(index % self.num_policies)).actor
 
 
+@in_32_bits
 def _act(parts: Parts, actor: Any, states: jax.Array, key: jax.Array) -> jax.Array:
     size = parts.sac.observation_size
     if jnp.shape(states)[-1:] != (size,):
@@ -239,6 +248,7 @@ def paths(visited: Occupancy) -> Paths:
     return Paths(np.moveaxis(states, 0, 1), alive.T, np.asarray(visited.episode_policy))
 
 
+@in_32_bits
 def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> Run:
     """Loads the results of a run as of its last checkpoint; the replay stays on disk.
 

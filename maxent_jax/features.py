@@ -14,6 +14,7 @@ import numpy as np
 
 from maxent_jax import envs
 from maxent_jax.envs.task import observation_size
+from maxent_jax.precision import in_32_bits
 from maxent_jax.types import Features
 
 NUM_PROJECTIONS = 5
@@ -29,17 +30,17 @@ class FeatureMap:
     projection: tuple[tuple[float, ...], ...]  # [D - coordinates, 5 or 0], order 1 each
     names: tuple[str, ...]
 
+    @in_32_bits
     def __call__(self, observation: jax.Array) -> jax.Array:
         """[..., D] -> [..., F].
 
         Raises:
           ValueError: another D than that of the environment.
         """
+        observation = jnp.asarray(observation, jnp.float32)
         size = len(self.coordinates) + len(self.projection)
-        if self.projection and jnp.shape(observation)[-1:] != (size,):
-            raise ValueError(
-                f"states have shape {jnp.shape(observation)}, but must be [..., {size}]"
-            )
+        if self.projection and observation.shape[-1:] != (size,):
+            raise ValueError(f"states have shape {observation.shape}, but must be [..., {size}]")
         kept = observation[..., list(self.coordinates)]
         kept = kept / jnp.broadcast_to(jnp.array(self.units), kept.shape)
         if not self.projection:

@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).parent.parent / "maxent_jax"
 # The reading order of the package, first to last.
 ORDER = [
-    *("types", "choices", "presets", "config", "convergence"),
+    *("types", "precision", "choices", "presets", "config", "convergence"),
     *("runs", "integrity", "headless", "runtime", "native"),
     *("runs.interruption", "runs.locks", "runs.sinks", "runs.display", "runs.clock", "runs.hosts"),
     *("density.histogram", "density.knn", "density.sharding"),
