@@ -308,8 +308,7 @@ def _check(config: Config) -> None:
         most = _UNROLLED.get(name, MOST)
         if getattr(config, name) > most:
             raise ConfigError(
-                f"{name.replace('_', '-')} is {getattr(config, name)}, but must be at most "
-                f"{most:,}."
+                f"{name.replace('_', '-')} is {getattr(config, name)}, but must be at most {most}."
             )
     _check_together(config)
 
@@ -386,18 +385,18 @@ def _check_together(c: Config) -> None:
         (
             c.num_iterations * c.steps_per_iteration > MOST,
             f"num-iterations × steps-per-iteration is {c.num_iterations * c.steps_per_iteration}, "
-            f"but must be at most {MOST:,}: steps are counted in 32 bits.",
+            f"but must be at most {MOST}: steps are counted in 32 bits.",
         ),
         (
             c.num_iterations * c.steps_per_iteration * c.updates_per_step > MOST,
             f"num-iterations × steps-per-iteration × updates-per-step is "
             f"{c.num_iterations * c.steps_per_iteration * c.updates_per_step:g}, but must be at "
-            f"most {MOST:,}: gradient steps are counted in 32 bits.",
+            f"most {MOST}: gradient steps are counted in 32 bits.",
         ),
         (
             c.mixture_episodes * c.episode_length > MOST,
             f"mixture-episodes × episode-length is {c.mixture_episodes * c.episode_length}, but "
-            f"must be at most {MOST:,}: states are counted in 32 bits.",
+            f"must be at most {MOST}: states are counted in 32 bits.",
         ),
         (
             c.num_neighbors >= c.reference_size,

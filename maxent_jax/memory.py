@@ -6,30 +6,21 @@ run, and what is not refused may still fail, with a sentence and exit code 1.
 
 import functools
 import math
-import os
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 
-from maxent_jax import algorithm, parts
+from maxent_jax import algorithm, machine, parts
 from maxent_jax.choices import ConfigError
 from maxent_jax.config import MOST, Config
+from maxent_jax.machine import Room, readable
 
 FLOAT = 4  # bytes
 LARGE_POLICY = 2**28  # bytes of one: from here on the networks are to blame, and not their number
 MANY_COPIES = 64
-CGROUPS = Path("/sys/fs/cgroup")
 # Whose arrays devices that train one seed divide among them, see devices.placement.
 DIVIDED = ("replay-size", "yaw-copies", "num-envs")
-
-
-class Room(NamedTuple):
-    """Memory that there is."""
-
-    size: int  # bytes
-    of: str  # whose it is, in words
 
 
 def check(config: Config, devices: Sequence[jax.Device]) -> None:
@@ -72,7 +63,7 @@ def check_rows(config: Config, num_rows: int, what: str) -> None:
             f"{readable(room.size)}: choose fewer."
         )
     if num_rows > MOST:
-        raise ConfigError(f"{num_rows} {what} are more than {MOST:,}: choose fewer.")
+        raise ConfigError(f"{num_rows} {what} are more than {MOST}: choose fewer.")
 
 
 def on_a_device(config: Config, num_devices: int = 1) -> dict[str, int]:
@@ -131,27 +122,13 @@ def nbytes(tree: Any) -> int:
     return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
-def machine() -> Room:
-    """What this process may have of the machine's memory."""
-    return min(_limits(), key=lambda room: room.size)
-
-
-def readable(size: float) -> str:
-    """A number of bytes in the largest unit that fits."""
-    units = ["bytes", "KiB", "MiB", "GiB", "TiB", "PiB"]
-    while size >= 1024 and len(units) > 1:
-        size /= 1024
-        units.pop(0)
-    return f"{size:,.0f} {units[0]}" if size >= 100 else f"{size:.3g} {units[0]}"
-
-
 def _room(devices: Sequence[jax.Device]) -> Room:
     """Of each device: its own memory, or its share of the machine's."""
     device = devices[0]
     limit = (device.memory_stats() or {}).get("bytes_limit") if device.platform != "cpu" else None
     if limit:
         return Room(limit, f"the {device.device_kind}")
-    whole = machine()
+    whole = machine.memory()
     here = sum(d.process_index == jax.process_index() for d in devices) or 1
     return whole._replace(size=whole.size // here)
 
@@ -160,48 +137,3 @@ def _bytes_of_a_visit(config: Config) -> int:
     """Of a state that a rollout reached: itself, its features, its policy and its weight."""
     made = parts.make(config)
     return FLOAT * (made.sac.observation_size + len(made.phi.names) + 2)
-
-
-def _limits() -> Iterator[Room]:
-    try:
-        yield Room(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), "this machine")
-    except (AttributeError, ValueError, OSError):  # a system that does not tell
-        yield Room(2**63, "this machine")
-    for path in _cgroup_files():
-        try:
-            yield Room(int(path.read_text(encoding="ascii")), "this container")
-        except (OSError, ValueError):  # not there; or "max", no limit
-            continue
-    yield from _process_limits()
-
-
-def _cgroup_files() -> Iterator[Path]:
-    """Where Linux keeps the limits of this process's control groups, of versions 2 and 1."""
-    try:
-        lines = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
-    except (OSError, ValueError):
-        return
-    for line in lines:
-        _, controllers, name = line.split(":", 2)
-        if controllers and "memory" not in controllers.split(","):
-            continue
-        root = CGROUPS / "memory" if controllers else CGROUPS
-        group = root / name.lstrip("/")
-        for folder in (group, *group.parents):
-            yield folder / ("memory.limit_in_bytes" if controllers else "memory.max")
-            if folder == root:
-                break
-
-
-def _process_limits() -> Iterator[Room]:
-    """`ulimit -v`, less what the process has already."""
-    try:
-        import resource
-
-        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-        if limit != resource.RLIM_INFINITY:
-            pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-            used = pages * os.sysconf("SC_PAGE_SIZE")
-            yield Room(max(limit - used, 0), "this process (ulimit -v)")
-    except (ImportError, OSError, ValueError):
-        return

@@ -14,7 +14,7 @@ def in_32_bits(function: Function) -> Function:
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        if not jax.config.jax_enable_x64:
+        if not jax.config.jax_enable_x64:  # type: ignore[attr-defined]
             return function(*args, **kwargs)
         with jax.enable_x64(False):
             return function(*args, **kwargs)

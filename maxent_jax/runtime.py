@@ -11,6 +11,7 @@ import tempfile
 from pathlib import Path
 from types import ModuleType
 
+from maxent_jax import machine
 from maxent_jax.choices import UsageError
 
 IN_ORDER = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
@@ -44,9 +45,11 @@ def prepare(simulates_in_jax: bool) -> None:
         64 environments on. It costs other programs 5 to 10 %, and must precede the first
         computation. A user's own XLA_FLAGS are kept.
     Raises:
-      UsageError: the environment has a variable with which jax cannot start.
+      UsageError: the environment has a variable, or the shell a limit, with which jax cannot start.
     """
-    _check_flags()
+    if "jax" not in sys.modules:
+        machine.check_limits()
+        _check_flags()
     jax = _load()
     for name, value in SETTLED.items():
         if name.upper() in os.environ and name in jax.config.values:
@@ -99,7 +102,7 @@ def _load() -> ModuleType:
 def _check_flags() -> None:
     """Where the user has set XLA_FLAGS: XLA ends a process for a flag that it does not know."""
     flags = os.environ.get("XLA_FLAGS", "").replace(IN_ORDER, "").strip()
-    if not flags or "jax" in sys.modules:
+    if not flags:
         return
     done = subprocess.run(
         [sys.executable, "-c", PROBE],

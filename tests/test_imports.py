@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).parent.parent / "maxent_jax"
 # The reading order of the package, first to last.
 ORDER = [
     *("types", "precision", "choices", "presets", "config", "convergence"),
-    *("runs", "integrity", "headless", "runtime", "native"),
+    *("runs", "integrity", "headless", "machine", "runtime", "native"),
     *("runs.interruption", "runs.locks", "runs.sinks", "runs.display", "runs.clock", "runs.hosts"),
     *("density.histogram", "density.knn", "density.sharding"),
     *("density.entropy", "density.reservoir"),

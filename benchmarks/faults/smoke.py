@@ -20,6 +20,12 @@ def command(directory: Path, *flags: str) -> list[str]:
     return [sys.executable, "-m", "experiments.train", *SMOKE, "--out", str(directory), *flags]
 
 
+def train_pendulum(directory: Path) -> None:
+    """A run that takes seconds, to its end."""
+    small = ("train", "--preset", "smoke", "--env", "pendulum", "--out", str(directory))
+    subprocess.run([sys.executable, "-m", "maxent_jax", *small], capture_output=True, check=True)
+
+
 def start(directory: Path, *flags: str) -> subprocess.Popen[str]:
     """A smoke run in a process of its own."""
     return subprocess.Popen(

@@ -42,6 +42,7 @@ def main(argv: Sequence[str]) -> None:
     if arguments.episodes < 1 or arguments.seed < 0:
         raise cli.UsageError("--episodes must be at least 1, and --seed 0 or more.")
     config = runs.read_config(arguments.directory)
+    runs.check_writable(arguments.directory)
     runtime.start(config.simulates_in_jax)
     if arguments.gymnasium:
         from maxent_jax import gymnasium_play

@@ -58,6 +58,7 @@ def main(argv: Sequence[str]) -> None:
     arguments = cli.parse(Arguments, argv, "render")
     config = runs.read_config(arguments.directory)
     _check(arguments, config.archive_size)
+    runs.check_writable(arguments.directory)
     headless.check_drawable(config.env)
     video.check()
     headless.choose_backend()

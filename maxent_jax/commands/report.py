@@ -70,6 +70,7 @@ def _check(arguments: Arguments) -> Path:
     path = arguments.out or here / "report.html"
     if path.is_dir() or not path.parent.is_dir():
         raise cli.UsageError(f"cannot write to {path}: --out must name a file in a directory.")
+    runs.check_writable(path.parent)
     return path
 
 

@@ -6,6 +6,7 @@ figures/. `--resume` goes on from the last complete checkpoint.
 
 import contextlib
 import dataclasses
+import os
 import re
 import shutil
 import time
@@ -65,6 +66,8 @@ def read_arguments(argv: Sequence[str]) -> Arguments:
     Raises:
       UsageError, ConfigError, RunError: one sentence each.
     """
+    if cli.flag_value(argv, "--out") == "":
+        raise cli.UsageError("out is empty: name a directory, or leave --out away.")
     default = Arguments(_default_config(argv))
     arguments = cli.parse(Arguments, argv, "train", default=default)
     _check_saving(arguments)
@@ -109,6 +112,7 @@ def check_free(arguments: Arguments) -> None:
     """
     directory = arguments.directory
     try:
+        _check_writable(directory)
         if not directory.exists() or (directory.is_dir() and _is_nobodys(directory)):
             return
     except OSError as error:
@@ -120,8 +124,19 @@ def check_free(arguments: Arguments) -> None:
             f"{directory} already exists: choose another --out, or add --resume to go on with it "
             f"or --overwrite to begin anew."
         )
-    elif not (directory / runs.CONFIG).is_file():
+    elif not runs.is_config(directory / runs.CONFIG):
         raise cli.UsageError(f"{directory} is not the directory of a run: it is left as it is.")
+
+
+def _check_writable(directory: Path) -> None:
+    """Raises UsageError where the directory cannot be made, or nothing be written into it."""
+    place = next(p for p in (directory, *directory.absolute().parents) if os.path.lexists(p))
+    if place.is_symlink() and not place.exists():
+        raise cli.UsageError(f"cannot write to {directory}: {place} is a link to nowhere.")
+    if not place.is_dir() and place != directory:
+        raise cli.UsageError(f"cannot write to {directory}: {place} is no directory.")
+    if place.is_dir() and not os.access(place, os.W_OK | os.X_OK):
+        raise cli.UsageError(f"cannot write to {directory}: {place} is not writable.")
 
 
 def _is_nobodys(directory: Path) -> bool:

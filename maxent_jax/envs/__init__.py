@@ -7,6 +7,7 @@ brax's, or `user:NAME` for one that `register` was told of.
 import contextlib
 import functools
 import io
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -192,4 +193,6 @@ def _make_brax(name: str, backend: str, _physics: str) -> Env:
     options: dict[str, Any] = {} if backend == "auto" else {"backend": backend}
     if name in BRAX_HIDES_POSITION:
         options["exclude_current_positions_from_observation"] = False
-    return brax_envs.get_environment(name, **options)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Brax System")  # that MJX is better kept
+        return brax_envs.get_environment(name, **options)

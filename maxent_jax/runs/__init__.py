@@ -182,6 +182,16 @@ def jsonable(value: Any) -> Any:
     return value
 
 
+def check_writable(directory: Path) -> None:
+    """Whether a command can leave its results there.
+
+    Raises:
+      RunError: it cannot.
+    """
+    if not os.access(directory, os.W_OK | os.X_OK):
+        raise RunError(f"{directory} cannot be written to: make it writable, or copy it elsewhere.")
+
+
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Turns a full disk or a missing permission into one sentence.
