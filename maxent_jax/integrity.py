@@ -61,10 +61,17 @@ def find(
         passed_over[name] = f"{sentence}."
     if passed_over:
         raise CheckpointCorruptError(f"{sentence}, and none before it is intact.")
-    raise CheckpointError(
-        f"{run_directory} holds no complete checkpoint: its run has not saved one yet; train it, "
-        f"with --resume if it is not running."
-    )
+    check_any(run_directory)
+    return find(run_directory, whole, fallback)  # one that was saved meanwhile
+
+
+def check_any(run_directory: Path) -> None:
+    """Raises CheckpointError where the run has no checkpoint."""
+    if not checkpoints(run_directory):
+        raise CheckpointError(
+            f"{run_directory} holds no complete checkpoint: its run has not saved one yet; train "
+            f"it, with --resume if it is not running."
+        )
 
 
 def damages(run_directory: Path, name: str, whole: bool = True) -> Iterator[str]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from maxent_jax import runs, runtime
+from maxent_jax import integrity, runs, runtime
 from maxent_jax.commands import cli
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ def main(argv: Sequence[str]) -> None:
     if arguments.episodes < 1 or arguments.seed < 0:
         raise cli.UsageError("--episodes must be at least 1, and --seed 0 or more.")
     config = runs.read_config(arguments.directory)
+    integrity.check_any(arguments.directory)
     runs.check_writable(arguments.directory)
     runtime.start(config.simulates_in_jax)
     if arguments.gymnasium:

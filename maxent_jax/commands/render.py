@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from maxent_jax import headless, runs, runtime
+from maxent_jax import headless, integrity, runs, runtime
 from maxent_jax.commands import cli
 from maxent_jax.runs import display
 from maxent_jax.visual import video
@@ -58,6 +58,7 @@ def main(argv: Sequence[str]) -> None:
     arguments = cli.parse(Arguments, argv, "render")
     config = runs.read_config(arguments.directory)
     _check(arguments, config.archive_size)
+    integrity.check_any(arguments.directory)
     runs.check_writable(arguments.directory)
     headless.check_drawable(config.env)
     video.check()

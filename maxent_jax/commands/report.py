@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from maxent_jax import runs, runtime
+from maxent_jax import integrity, runs, runtime
 from maxent_jax.commands import cli, render
 from maxent_jax.runs import display
 
@@ -50,6 +50,8 @@ def main(argv: Sequence[str]) -> None:
     arguments = cli.parse(Arguments, argv, "report")
     configs = [runs.read_config(directory) for directory in arguments.directories]
     path = _check(arguments)
+    for directory in arguments.directories:
+        integrity.check_any(directory)
     runtime.start(any(config.simulates_in_jax for config in configs))
     page = make(arguments)
     with runs.whole_file(path) as temporary:
