@@ -98,13 +98,11 @@ def of_a_seed(config: Config) -> dict[str, int]:
         "hidden-size": 2 * agent + (actors if large else 0),
         "mixture-episodes": visited + (0 if large else actors),
     }
-    step = {
-        "num-envs" if c.updates_per_vector_step > c.batch_size else "batch-size": FLOAT
-        * drawn
-        * 2
-        * num_dims,
-        "hidden-size": agent + FLOAT * c.batch_size * c.hidden_size * c.hidden_layers * 3,
-    }
+    batches = "num-envs" if c.updates_per_vector_step > c.batch_size else "batch-size"
+    layers = "batch-size" if c.batch_size > c.hidden_size else "hidden-size"
+    step = {"num-envs": 0, "batch-size": 0, "hidden-size": agent}
+    step[batches] += FLOAT * drawn * 2 * num_dims
+    step[layers] += FLOAT * c.batch_size * c.hidden_size * c.hidden_layers * 3
     beside = max(begin_or_end, step, key=lambda need: sum(need.values()))
     of_state = {
         "replay-size" if c.yaw_copies < MANY_COPIES else "yaw-copies": nbytes(learner.replay),

@@ -146,8 +146,9 @@ def _places(folder: Path) -> dict[str, Path]:
     )
     runs.write_config(places["begun"], preset("smoke"), {}, {})
     runs.write_config(places["run"], preset("smoke"), {}, {})
-    (places["run"] / integrity.FOLDER / "2").mkdir(parents=True)  # for all that the name says
     runs.write_config(places["pendulum"], preset("smoke", env="pendulum"), {}, {})
+    for name in ("run", "pendulum"):
+        (places[name] / integrity.FOLDER / "2").mkdir(parents=True)  # saved, by its name
     places["file"] = folder / "file"
     places["file"].write_text("", encoding="utf-8")
     return places

@@ -56,7 +56,6 @@ def settle() -> None:
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)
-    codecs.register_error("maxent_plain", _spell)
     if sys.stdin is None:
         sys.stdin = io.TextIOWrapper(io.FileIO(0, closefd=False), "utf-8")
     sys.stdout = _wrapped(sys.stdout, sys.__stdout__, 1, _Output)
@@ -99,3 +98,6 @@ def _spell(error: UnicodeError) -> tuple[str | bytes, int]:
         return letters.encode("utf-8", "surrogateescape"), error.end
     spelled = letters.translate(_PLAIN)
     return "".join(letter if letter.isascii() else "?" for letter in spelled), error.end
+
+
+codecs.register_error("maxent_plain", _spell)
