@@ -121,6 +121,8 @@ def _check_flags() -> None:
 
 def _settle_cache(jax: ModuleType) -> None:
     """In the user's own cache folder, unless jax was told of another; off where it is read-only."""
+    if not jax.config.values["jax_enable_compilation_cache"]:  # as the user or we have settled
+        return
     folder = jax.config.values["jax_compilation_cache_dir"]
     try:
         if not folder:

@@ -141,6 +141,7 @@ def test_evaluate_measures_the_gap_to_gymnasium(run, directory, capsys):
 
 def test_evaluate_says_where_gymnasium_has_no_such_environment(tmp_path):
     runs.write_config(tmp_path, preset("smoke", env="pendulum"), {}, {})
+    (tmp_path / "checkpoints" / "1").mkdir(parents=True)
     with pytest.raises(ConfigError, match="pendulum is not played in Gymnasium"):
         evaluate.main([str(tmp_path), "--gymnasium"])
 

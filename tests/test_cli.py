@@ -143,6 +143,8 @@ def test_without_a_cache_folder_programs_are_compiled_anew(
     assert not jax.config.values["jax_enable_compilation_cache"]
     said = capsys.readouterr().err
     assert said.startswith("note: programs are compiled anew") and said.count("\n") == 1
+    runtime.prepare(False)
+    assert not capsys.readouterr().err  # it is said once
 
 
 def test_limits_with_which_jax_cannot_start_are_named(monkeypatch):
