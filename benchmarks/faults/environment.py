@@ -94,10 +94,10 @@ GROUPS: dict[str, tuple[Fault, ...]] = {
         harmless("JAX_NUMPY_DTYPE_PROMOTION=strict"),
         harmless("JAX_TRANSFER_GUARD=disallow"),
         harmless("JAX_RAISE_PERSISTENT_CACHE_ERRORS=1 JAX_COMPILATION_CACHE_DIR={empty}"),
-        harmless("JAX_COMPILATION_CACHE_DIR=/proc/none", "/proc/none cannot be written"),
+        Fault("evaluate {run}", 0, "/proc/none", variables="JAX_COMPILATION_CACHE_DIR=/proc/none"),
         harmless("XDG_CACHE_HOME={file}", "compiled anew"),
         harmless("-HOME -XDG_CACHE_HOME"),
-        harmless("HOME=/proc/none -XDG_CACHE_HOME", "compiled anew"),
+        Fault("evaluate {run}", 0, "anew", variables="HOME=/proc/none -XDG_CACHE_HOME"),
         harmless("TMPDIR=/no/such/folder"),
         harmless("MPLBACKEND=bogus"),
         harmless("MPLCONFIGDIR={file}"),
@@ -268,16 +268,17 @@ def _cause(fault: Fault, places: dict[str, Path], new: Path) -> tuple[str, float
     seconds = round(time.perf_counter() - started, 2)
     said = done.stderr.decode(errors="replace")
     closed = "2>&-" in fault.shell or "2> /dev/full" in fault.shell
+    met = done.returncode == fault.code
     sentence = "note: " if fault.code == 0 else "error: "
     for right, otherwise in (
-        (done.returncode == fault.code, f"exit code {done.returncode}: {said[-300:]}"),
+        (met, f"exit code {done.returncode}: {said[-300:]}"),
         ("Traceback" not in said, f"a traceback: {said[-300:]}"),
         (closed or fault.says in said, f"said: {said[-300:]}"),
         (closed or not fault.says or said.startswith(sentence), f"said: {said[:300]}"),
         (said.count("\n") == bool(fault.says) - (closed and bool(fault.says)), f"said: {said}"),
         (fault.code != 2 or seconds <= REFUSAL_SECONDS, f"took {seconds} s"),
         (fault.code != 2 or not new.exists(), "it left a directory"),
-        (not fault.same or smoke.same(places["undisturbed"], new), "other bits"),
+        (not fault.same or not met or smoke.same(places["undisturbed"], new), "other bits"),
     ):
         if not right:
             return otherwise, seconds

@@ -3,6 +3,7 @@
 import functools
 import importlib
 import io
+import os
 import re
 import sys
 import warnings
@@ -88,7 +89,7 @@ def entry_point(main: Callable[[Sequence[str]], None]) -> Callable[[Sequence[str
     @functools.wraps(main)
     def run(argv: Sequence[str]) -> None:
         streams.settle()
-        _silence_warnings()
+        _settle_other_packages()
         try:
             code = _exit_code(main, argv)
             streams.finish()
@@ -149,8 +150,13 @@ def _asked_for(error: Exception) -> str:
     return f" ({asked[0].rstrip('.')})" if asked else ""
 
 
-def _silence_warnings() -> None:
-    """Other packages warn when they are imported: with -W error they would end every command."""
+def _settle_other_packages() -> None:
+    """Keeps a user's settings for other programs from ending every command.
+
+    Packages warn when they are imported, which -W error makes an exception. Matplotlib refuses to
+    be imported with an MPLBACKEND that it does not know; figures here need no screen.
+    """
+    os.environ["MPLBACKEND"] = "agg"
     if any(option.startswith("error") for option in sys.warnoptions):
         warnings.simplefilter("ignore")
 

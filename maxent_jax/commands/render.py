@@ -58,11 +58,11 @@ def main(argv: Sequence[str]) -> None:
     arguments = cli.parse(Arguments, argv, "render")
     config = runs.read_config(arguments.directory)
     _check(arguments, config.archive_size)
-    integrity.check_any(arguments.directory)
-    runs.check_writable(arguments.directory)
     headless.check_drawable(config.env)
     video.check()
     headless.choose_backend()
+    integrity.check_any(arguments.directory)
+    runs.check_writable(arguments.directory)
     runtime.start(config.simulates_in_jax)
     _film(arguments)
 
