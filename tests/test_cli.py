@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import jax
@@ -179,6 +180,15 @@ def test_what_the_system_refuses_is_one_sentence(capsys):
 
 def test_a_path_with_a_line_break_keeps_the_sentence_on_one_line(capsys):
     assert ended(runs.RunError("a\nb is no run."), capsys) == (2, "error: a b is no run.\n")
+
+
+def test_settings_for_other_programs_end_no_command(monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "bogus")  # with which matplotlib cannot be imported
+    monkeypatch.setattr(sys, "warnoptions", ["error"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        cli.entry_point(lambda _: warnings.warn("of another package", stacklevel=1))([])
+    assert os.environ["MPLBACKEND"] == "agg"
 
 
 def test_a_mistake_of_ours_is_not_hidden():
