@@ -41,6 +41,14 @@ def check_drawable(env: str) -> None:
         )
 
 
+def draw_nothing() -> None:
+    """For commands that draw no robots, before MuJoCo is loaded: it cannot be with a MUJOCO_GL that
+    it does not know, or whose system packages are missing.
+    """
+    if "mujoco" not in sys.modules:
+        os.environ[VARIABLE] = "disable"
+
+
 @functools.cache
 def choose_backend() -> str:
     """Settles MUJOCO_GL: the user's own value, else the first of egl and osmesa that draws.

@@ -3,6 +3,7 @@
 import functools
 import importlib
 import io
+import logging
 import os
 import re
 import sys
@@ -154,9 +155,11 @@ def _settle_other_packages() -> None:
     """Keeps a user's settings for other programs from ending every command.
 
     Packages warn when they are imported, which -W error makes an exception. Matplotlib refuses to
-    be imported with an MPLBACKEND that it does not know; figures here need no screen.
+    be imported with an MPLBACKEND that it does not know, and talks of its own cache folder; figures
+    here need neither.
     """
     os.environ["MPLBACKEND"] = "agg"
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     if any(option.startswith("error") for option in sys.warnoptions):
         warnings.simplefilter("ignore")
 

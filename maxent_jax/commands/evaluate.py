@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from maxent_jax import integrity, runs, runtime
+from maxent_jax import headless, integrity, runs, runtime
 from maxent_jax.commands import cli
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ def main(argv: Sequence[str]) -> None:
     config = runs.read_config(arguments.directory)
     integrity.check_any(arguments.directory)
     runs.check_writable(arguments.directory)
+    headless.draw_nothing()
     runtime.start(config.simulates_in_jax)
     if arguments.gymnasium:
         from maxent_jax import gymnasium_play

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from maxent_jax import integrity, runs, runtime
+from maxent_jax import headless, integrity, runs, runtime
 from maxent_jax.commands import cli, render
 from maxent_jax.runs import display
 
@@ -52,6 +52,7 @@ def main(argv: Sequence[str]) -> None:
     path = _check(arguments)
     for directory in arguments.directories:
         integrity.check_any(directory)
+    headless.draw_nothing()
     runtime.start(any(config.simulates_in_jax for config in configs))
     page = make(arguments)
     with runs.whole_file(path) as temporary:

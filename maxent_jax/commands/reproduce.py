@@ -18,7 +18,7 @@ from typing import Annotated
 
 import tyro
 
-from maxent_jax import runs, runtime
+from maxent_jax import headless, runs, runtime
 from maxent_jax.choices import check_choice
 from maxent_jax.commands import cli, train
 from maxent_jax.runs import locks
@@ -63,6 +63,7 @@ def main(argv: Sequence[str]) -> None:
     whats = tuple(FIGURES) if arguments.what == "all" else (arguments.what,)
     names = dict.fromkeys(name for what in whats for name in FIGURES.get(what, (what,)))
     studies = {name: protocol.make(name, arguments.scale, arguments.seeds) for name in names}
+    headless.draw_nothing()
     if "fig3" in whats:
         runtime.prepare(simulates_in_jax=False)
         from maxent_jax.studies import classic_weights  # loads jax

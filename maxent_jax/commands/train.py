@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from maxent_jax import integrity, runs, runtime
+from maxent_jax import headless, integrity, runs, runtime
 from maxent_jax.commands import cli
 from maxent_jax.config import Config, preset
 from maxent_jax.runs import locks
@@ -235,7 +235,9 @@ def main(argv: Sequence[str]) -> None:
     arguments = read_arguments(argv)
     config, num_devices = arguments.config, arguments.devices
     check_free(arguments)
-    runtime.prepare(config.simulates_in_jax)
+    headless.draw_nothing()
+    load = runtime.prepare if arguments.coordinator else runtime.start
+    load(config.simulates_in_jax)
     from maxent_jax.runs import driver, hosts  # loads jax
 
     holding: contextlib.AbstractContextManager[None] = claimed(arguments)
