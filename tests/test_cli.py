@@ -13,7 +13,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from maxent_jax import integrity, machine, runs, runtime
+from maxent_jax import envs, headless, integrity, machine, runs, runtime
 from maxent_jax.choices import UsageError
 from maxent_jax.commands import cli, streams, train
 from maxent_jax.config import preset
@@ -184,11 +184,22 @@ def test_a_path_with_a_line_break_keeps_the_sentence_on_one_line(capsys):
 
 def test_settings_for_other_programs_end_no_command(monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "bogus")  # with which matplotlib cannot be imported
+    monkeypatch.setenv("COLUMNS", "1")  # at which tyro's help never ends
     monkeypatch.setattr(sys, "warnoptions", ["error"])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         cli.entry_point(lambda _: warnings.warn("of another package", stacklevel=1))([])
-    assert os.environ["MPLBACKEND"] == "agg"
+    assert (os.environ["MPLBACKEND"], os.environ["COLUMNS"]) == ("agg", "40")
+
+
+def test_a_command_that_draws_nothing_needs_no_opengl(monkeypatch):
+    assert envs.TASKS  # which loads MuJoCo
+    monkeypatch.setenv(headless.VARIABLE, "bogus")
+    headless.draw_nothing()
+    assert os.environ[headless.VARIABLE] == "bogus"  # MuJoCo is loaded, and has read it
+    monkeypatch.delitem(sys.modules, "mujoco")
+    headless.draw_nothing()
+    assert os.environ[headless.VARIABLE] == "disable"
 
 
 def test_a_mistake_of_ours_is_not_hidden():

@@ -246,21 +246,16 @@ def _cause(fault: Fault, places: dict[str, Path], new: Path) -> tuple[str, float
     places = places | {"new": new}
     places["gone"].mkdir(exist_ok=True)
     filled = {name: str(path) for name, path in places.items()}
-    environment = dict(os.environ) | {"PYTHONPATH": os.getcwd()}
-    for word in fault.variables.format(**filled).split():
-        name, _, value = word.partition("=")
-        if name.startswith("-"):
-            environment.pop(name[1:], None)
-        else:
-            environment[name] = value
+    given = fault.variables.format(**filled).split()
+    variables = " ".join(f"-u {word[1:]}" if word.startswith("-") else word for word in given)
     words = fault.arguments.format(**filled)
     shell = fault.shell.format(**filled)
-    script = f"set -- {sys.executable} -m maxent_jax {words}; {shell}"
+    script = f"set -- env {variables} {sys.executable} -m maxent_jax {words}; {shell}"
     apart = ["unshare", "--user", "--map-root-user", "--mount"] if fault.apart else []
     started = time.perf_counter()
     done = subprocess.run(
         [*apart, "bash", "-c", script],
-        env=environment,
+        env=os.environ | {"PYTHONPATH": os.getcwd()},
         capture_output=True,
         timeout=UNLIMITED_SECONDS,
         check=False,

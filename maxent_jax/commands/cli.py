@@ -6,6 +6,7 @@ import io
 import logging
 import os
 import re
+import shutil
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -21,6 +22,7 @@ from maxent_jax.commands.streams import OutputError
 from maxent_jax.runs import NonFiniteError, RunError, SaveError
 from maxent_jax.runs.interruption import Interrupted
 
+NARROWEST = 40  # columns
 Arguments = TypeVar("Arguments")
 
 
@@ -156,8 +158,10 @@ def _settle_other_packages() -> None:
 
     Packages warn when they are imported, which -W error makes an exception. Matplotlib refuses to
     be imported with an MPLBACKEND that it does not know, and talks of its own cache folder; figures
-    here need neither.
+    here need neither. Tyro does not end its help in a terminal of a few columns.
     """
+    if shutil.get_terminal_size().columns < NARROWEST:
+        os.environ["COLUMNS"] = str(NARROWEST)
     os.environ["MPLBACKEND"] = "agg"
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     if any(option.startswith("error") for option in sys.warnoptions):
