@@ -86,7 +86,7 @@ def run_command(command: Command, work: Path, toy: bool, seconds: float) -> dict
     arguments = [word.format(work=work) for word in (command.toy if toy else command.arguments)]
     started = time.perf_counter()
     log = work / f"{command.name}.log"
-    with open(log, "w") as errors:
+    with open(log, "w", encoding="utf-8") as errors:
         process = subprocess.Popen(
             [sys.executable, "-m", *arguments],
             stdout=subprocess.PIPE,
@@ -106,7 +106,7 @@ def run_command(command: Command, work: Path, toy: bool, seconds: float) -> dict
         "seconds": time.perf_counter() - started,
         "rows": [json.loads(line) for line in lines if line.startswith("{")],
         "notes": [line for line in lines if not line.startswith("{")],
-        "log_tail": log.read_text().splitlines()[-40:],
+        "log_tail": log.read_text(encoding="utf-8").splitlines()[-40:],
     }
 
 
@@ -133,7 +133,7 @@ def run_part(name: str, out: Path, work: Path, toy: bool) -> bool:
     succeeded = True
     for command in PARTS[name].commands:
         path = out / f"{command.name}.json"
-        if path.exists() and json.loads(path.read_text())["exit_code"] == 0:
+        if path.exists() and json.loads(path.read_text(encoding="utf-8"))["exit_code"] == 0:
             continue
         found = run_command(command, work, toy, deadline - time.perf_counter())
         if (work / command.name / runs.METRICS).exists() and found["exit_code"] == 0:

@@ -115,7 +115,9 @@ def run(name: str, seed: int, base: dict[str, Any], cores: set[int]) -> dict[str
 
 def study(names, seeds, base, jobs: int, out: Path) -> Iterator[dict[str, Any]]:
     """Rows as they end, `jobs` runs side by side; each is in the file before it is yielded."""
-    kept = json.loads(out.read_text()) if out.exists() else {"base": base, "rows": []}
+    kept = (
+        json.loads(out.read_text(encoding="utf-8")) if out.exists() else {"base": base, "rows": []}
+    )
     done = kept["rows"]
     stale = [row["regime"] for row in done if row["changes"] != REGIMES.get(row["regime"])]
     if kept["base"] != base or stale:
@@ -206,7 +208,7 @@ def main() -> None:
         for row in study(args.regimes, args.seeds, base, args.jobs, out):
             common.progress(summary(row))
             rows.append(row)
-        every = json.loads(out.read_text())["rows"]
+        every = json.loads(out.read_text(encoding="utf-8"))["rows"]
         draw(every, out.with_suffix(".png"))
     for row in rows:
         common.emit(row)

@@ -68,7 +68,7 @@ def main() -> None:
     parser.add_argument("--env", choices=sorted(KEPT), required=True)
     name = parser.parse_args().env
     path = Path(maxent_jax.__file__).parent / "tables" / f"features_{name}.json"
-    path.write_text(json.dumps(measure(name), indent=1) + "\n")
+    path.write_text(json.dumps(measure(name), indent=1) + "\n", encoding="utf-8")
     print(f"wrote {path.name}")
 
 

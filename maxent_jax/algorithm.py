@@ -25,6 +25,7 @@ from maxent_jax.envs import base
 from maxent_jax.experience import Reference
 from maxent_jax.mixture import Archive
 from maxent_jax.parts import Parts
+from maxent_jax.precision import in_32_bits
 from maxent_jax.sac import agent
 from maxent_jax.sac.agent import Agent
 from maxent_jax.training import Learner
@@ -48,11 +49,13 @@ class State(NamedTuple):
 SEED_AXES = State(key=0, iteration=0, method=None, archive=0, learner=0)  # type: ignore[arg-type]
 
 
+@in_32_bits
 def init(config: Config, key: jax.Array) -> State:
     """Before the first iteration: π_0, untrained, is the whole mixture."""
     return _init(config.program(), methods.make(config), key)
 
 
+@in_32_bits
 def start(config: Config) -> State:
     """The first state of all the config's seeds, with a seed axis if they are more than one."""
     if config.num_seeds == 1:
@@ -71,6 +74,17 @@ def _init(config: Config, method: methods.Method, key: jax.Array) -> State:
     return State(key, jnp.zeros((), jnp.int32), method, archive, learner)
 
 
+def shapes(config: Config) -> State:
+    """The shape and dtype of every leaf of a seed's first state; nothing is computed."""
+    table = jax.ShapeDtypeStruct((config.archive_size, config.archive_size), jnp.float32)
+    number = jax.ShapeDtypeStruct((), jnp.int32)
+    flag = jax.ShapeDtypeStruct((), jnp.bool_)
+    method = methods.Method(table, number, flag, number)  # type: ignore[arg-type]
+    key = jax.eval_shape(jax.random.key, 0)
+    return jax.eval_shape(functools.partial(_init, config.program()), method, key)
+
+
+@in_32_bits
 def begin(config: Config, state: State) -> tuple[State, Metrics]:
     """Steps 1 to 3 of Algorithm 1, and the start of step 4."""
     p = parts.make(config)
@@ -118,6 +132,7 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
     return state._replace(key=key, learner=learner), metrics
 
 
+@in_32_bits
 def train_segment(config: Config, state: State) -> tuple[State, Metrics]:
     """`config.vector_steps` steps of all envs with their gradient steps (step 4)."""
     p = parts.make(config)
@@ -131,6 +146,7 @@ def train_segment(config: Config, state: State) -> tuple[State, Metrics]:
     return state._replace(key=key, learner=learner), reduce_metrics(metrics)
 
 
+@in_32_bits
 def end(config: Config, state: State) -> tuple[State, Metrics]:
     """Archives the agent, and measures what has been reached."""
     p = parts.make(config)
@@ -162,6 +178,7 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
     return state, metrics
 
 
+@in_32_bits
 def iterate(config: Config, state: State) -> tuple[State, Metrics]:
     """One iteration of Algorithm 1."""
     state, at_begin = begin(config, state)
@@ -172,6 +189,7 @@ def iterate(config: Config, state: State) -> tuple[State, Metrics]:
     return state, at_begin | reduce_metrics(in_segments) | at_end
 
 
+@in_32_bits
 def run(config: Config, state: State, num_iterations: int) -> tuple[State, Metrics]:
     """That many iterations as one program; metrics [T, ...]. Jit it with the state donated."""
     return jax.lax.scan(lambda s, _: iterate(config, s), state, length=num_iterations)

@@ -17,18 +17,20 @@ from maxent_jax import (
     dataset,
     export,
     integrity,
+    memory,
     methods,
     mixture,
     occupancy,
     parts,
     runs,
 )
-from maxent_jax.choices import CORRECTIVE
+from maxent_jax.choices import CORRECTIVE, check_path, check_whole
 from maxent_jax.config import Config
 from maxent_jax.density import histogram
 from maxent_jax.mixture import Archive
 from maxent_jax.occupancy import Occupancy, Scores
 from maxent_jax.parts import Parts
+from maxent_jax.precision import in_32_bits
 from maxent_jax.sac import agent
 
 if TYPE_CHECKING:
@@ -97,6 +99,7 @@ class Run:
             raise ImportError("Run.frame needs pandas: pip install pandas.") from None
         return DataFrame(_scalar_columns(self.metrics))
 
+    @in_32_bits
     def features(self, states: jax.Array | np.ndarray) -> jax.Array:
         """phi(s), where distances are taken: [..., D] -> [..., F]. `parts.phi.names` names them."""
         return self.parts.phi(jnp.asarray(states))
@@ -106,9 +109,11 @@ class Run:
 
         Raises:
           IndexError: no such policy.
+        The function raises ValueError where a state is not [..., D].
         """
-        return functools.partial(agent.act, self.parts.sac, self._actor(index))
+        return functools.partial(_act, self.parts, self._actor(index))
 
+    @in_32_bits
     def act(self, s: jax.Array, key: jax.Array, policy: int | None = None) -> jax.Array:
         """Actions [..., A] for states [..., D] by one policy, drawn by weight unless named.
 
@@ -127,8 +132,15 @@ class Run:
         """
         return export.policy(self.parts.sac, self._actor(index), deterministic)
 
+    @in_32_bits
     def occupancy(self, episodes_per_policy: int = 5, seed: int = 0) -> Occupancy:
-        """Fresh episodes of each policy, with each state's share of the mixture's occupancy."""
+        """Fresh episodes of each policy, with each state's share of the mixture's occupancy.
+
+        Raises:
+          ValueError: episodes_per_policy < 1, or more than fit into memory.
+        """
+        check_whole("episodes_per_policy", episodes_per_policy, least=1)
+        memory.check_episodes(self.config, episodes_per_policy * self.num_policies)
         key_starts, key_play = jax.random.split(jax.random.key(seed))
         num_episodes = episodes_per_policy * self.num_policies
         by_policy = self._parts_by_policy
@@ -136,8 +148,19 @@ class Run:
         weights = jnp.asarray(self.weights)
         return _of_mixture(by_policy, self.mixture, weights, starts, key_play)
 
+    @in_32_bits
     def occupancy_of(self, episodes: Paths) -> Occupancy:
-        """The same of episodes that were played elsewhere, at least one of each policy."""
+        """The same of episodes that were played elsewhere, at least one of each policy.
+
+        Raises:
+          ValueError: a policy without an episode, or one that is not in the mixture.
+        """
+        played = set(np.unique(episodes.policy).tolist())
+        if played != set(range(self.num_policies)):
+            raise ValueError(
+                f"episodes are of the policies {sorted(played)}, but must be of all from 0 to "
+                f"{self.num_policies - 1}"
+            )
         states = jnp.asarray(episodes.states).swapaxes(0, 1)
         alive = jnp.asarray(episodes.alive).T
         policy, none = jnp.asarray(episodes.policy, jnp.int32), jnp.zeros((), jnp.int32)
@@ -148,17 +171,20 @@ class Run:
         """Fresh episodes of each policy, as paths."""
         return paths(self.occupancy(episodes_per_policy, seed))
 
+    @in_32_bits
     def dataset(self, n: int, seed: int = 0) -> dict[str, np.ndarray]:
         """`n` transitions of fresh episodes of the mixture, for offline reinforcement learning.
 
         `np.savez_compressed(path, **run.dataset(n))` saves them. See dataset.collect for the keys.
 
         Raises:
-          ValueError: n < 1.
+          ValueError: n < 1, or more than fit into memory.
         """
+        dataset.check(self.config, n)
         weights, key = jnp.asarray(self.weights), jax.random.key(seed)
         return dataset.collect(self.parts, self.mixture, weights, n, key)
 
+    @in_32_bits
     def scores(self, visited: Occupancy, seed: int = 0) -> Scores:
         """Each policy's return under the reward that these states of the mixture define."""
         rows = mixture.draw_rows(visited.weight, self.config.reference_size, jax.random.key(seed))
@@ -180,6 +206,7 @@ class Run:
             for i in range(self.num_policies)
         ]
 
+    @in_32_bits
     def measures(self, visited: Occupancy, seed: int = 0) -> dict[str, float]:
         """Coverage and entropies of the mixture, named as in the metrics."""
         measured = occupancy.measures(self.parts, visited, jax.random.key(seed))
@@ -191,9 +218,21 @@ class Run:
         return parts.make(dataclasses.replace(self.config, pooled=False, mixing="episode"))
 
     def _actor(self, index: int) -> Any:
+        check_whole("policy", index)
         if not -self.num_policies <= index < self.num_policies:
-            raise IndexError(f"policy {index} of a mixture of {self.num_policies}")
+            raise IndexError(
+                f"policy is {index}, but the mixture has {self.num_policies}: choose from 0 to "
+                f"{self.num_policies - 1}"
+            )
         return mixture.policy(self.mixture, jnp.asarray(index % self.num_policies)).actor
+
+
+@in_32_bits
+def _act(parts: Parts, actor: Any, states: jax.Array, key: jax.Array) -> jax.Array:
+    size = parts.sac.observation_size
+    if jnp.shape(states)[-1:] != (size,):
+        raise ValueError(f"states have shape {jnp.shape(states)}, but must be [..., {size}]")
+    return agent.act(parts.sac, actor, jnp.asarray(states, jnp.float32), key)
 
 
 _of_mixture = jax.jit(occupancy.of_mixture, static_argnums=0)
@@ -209,6 +248,7 @@ def paths(visited: Occupancy) -> Paths:
     return Paths(np.moveaxis(states, 0, 1), alive.T, np.asarray(visited.episode_policy))
 
 
+@in_32_bits
 def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> Run:
     """Loads the results of a run as of its last checkpoint; the replay stays on disk.
 
@@ -220,11 +260,16 @@ def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> R
       RunError: not the directory of a run, or no such seed.
       CheckpointError: no complete checkpoint.
       CheckpointCorruptError: a file of it is not what was written.
+      TypeError: a path or an index of the wrong type.
     """
-    directory = Path(path)
+    directory = check_path("path", path)
+    seed_index = check_whole("seed_index", seed_index)
     config = runs.read_config(directory)
     if not 0 <= seed_index < config.num_seeds:
-        raise runs.RunError(f"{directory} has {config.num_seeds} seeds: no index {seed_index}.")
+        raise runs.RunError(
+            f"seed_index is {seed_index}, but {directory} has {config.num_seeds} "
+            f"{'seed' if config.num_seeds == 1 else 'seeds'}, counted from 0."
+        )
     name, passed_over = integrity.find(directory, whole=False, fallback=fallback)
     for sentence in passed_over.values():
         warnings.warn(sentence, stacklevel=2)

@@ -9,6 +9,7 @@ import contextlib
 import functools
 import json
 import logging
+import math
 import os
 import re
 import shutil
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
@@ -73,7 +75,7 @@ def save(run_directory: Path, state: State, progress: Progress, machine: dict[st
             shutil.rmtree(temporary, ignore_errors=True)
             temporary.mkdir(parents=True)
         with _silence():
-            ocp.save_checkpointables(temporary / ARRAYS, _items(_without_typed_key(state)))
+            ocp.save_checkpointables(temporary / ARRAYS, _items(_stored(state)))
         if first:
             shutil.copy(run_directory / runs.CONFIG, temporary)
             runs.write_metrics(temporary, progress.rows)
@@ -94,7 +96,7 @@ def save(run_directory: Path, state: State, progress: Progress, machine: dict[st
 def read_progress(run_directory: Path, name: str) -> tuple[Progress, dict[str, Any]]:
     """What that checkpoint's run had measured, and what it was computed with."""
     folder = run_directory / FOLDER / name
-    content = json.loads((folder / PROGRESS).read_text())
+    content = json.loads((folder / PROGRESS).read_text(encoding="utf-8"))
     begun, segments = None, []
     if content["begun"]:
         with np.load(folder / PARTIAL) as arrays:
@@ -113,11 +115,11 @@ def restore(run_directory: Path, name: str, config: Config, placed: State | None
     Raises:
       CheckpointError: it does not hold a state of this config.
     """
-    items = _load(run_directory, name, _items(_abstract(config, placed)))
+    shapes = _shapes(config)
+    items = _load(run_directory, name, _items(_abstract(shapes, placed)))
     results, rest = items["results"], items["rest"]
     learner = rest.learner._replace(visits=results.visits, random_visits=results.random_visits)
-    key = jax.random.wrap_key_data(rest.key)
-    return rest._replace(key=key, archive=results.archive, learner=learner)
+    return _as_computed(rest._replace(archive=results.archive, learner=learner), shapes, placed)
 
 
 def restore_results(run_directory: Path, name: str, config: Config) -> Results:
@@ -126,7 +128,7 @@ def restore_results(run_directory: Path, name: str, config: Config) -> Results:
     Raises:
       CheckpointError: it does not hold results of this config.
     """
-    abstract = {"results": _items(_abstract(config))["results"]}
+    abstract = {"results": _items(_abstract(_shapes(config)))["results"]}
     return _load(run_directory, name, abstract)["results"]
 
 
@@ -180,18 +182,61 @@ def _items(state: State) -> dict[str, Any]:
     }
 
 
-def _without_typed_key(state: State) -> State:
-    return state._replace(key=jax.random.key_data(state.key))
+def _stored(state: State) -> State:
+    """What Orbax is given: it has no place for an array without elements, nor our kind of keys."""
+
+    def of_leaf(x: Any) -> Any:
+        if math.prod(x.shape) == 0:
+            return None
+        return jax.random.key_data(x) if _is_key(x) else x
+
+    return jax.tree.map(of_leaf, state)
 
 
-def _abstract(config: Config, placed: State | None = None) -> State:
-    shapes = jax.eval_shape(lambda: _without_typed_key(algorithm.start(config)))
+def _as_computed(stored: State, shapes: State, placed: State | None) -> State:
+    """The state again, of which `_stored` gave only a part."""
+    leaves, tree = jax.tree.flatten(shapes)
+    shardings = [None] * len(leaves) if placed is None else jax.tree.leaves(placed)
+    kept = iter(jax.tree.leaves(stored))
+
+    def of_leaf(shape: Any, sharding: Any) -> Any:
+        if math.prod(shape.shape) == 0:
+            return jnp.empty(shape.shape, shape.dtype, device=sharding)
+        found = next(kept)
+        return jax.random.wrap_key_data(found, impl=_key_impl(shape)) if _is_key(shape) else found
+
+    return jax.tree.unflatten(tree, map(of_leaf, leaves, shardings))
+
+
+def _is_key(x: Any) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _key_impl(shape: Any) -> Any:
+    return jax.random.key_impl(jnp.empty((), shape.dtype))
+
+
+def _shapes(config: Config) -> State:
+    return jax.eval_shape(lambda: algorithm.start(config))
+
+
+def _abstract(shapes: State, placed: State | None = None) -> State:
+    """What Orbax is to load, and where each array is to lie."""
     if placed is None:
         device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
         placed = jax.tree.map(lambda _: device, shapes)
-    return jax.tree.map(
-        lambda x, sharding: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding),
+    # As `_stored`: its functions compute, and a shape has no values.
+    data = jax.eval_shape(
+        lambda state: jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, state),
         shapes,
+    )
+    return jax.tree.map(
+        lambda x, sharding: (
+            None
+            if math.prod(x.shape) == 0
+            else jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)
+        ),
+        data,
         placed,
     )
 

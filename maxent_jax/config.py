@@ -1,6 +1,7 @@
 """Every setting of a run, and the checks of their values. Loads no array library."""
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 from maxent_jax import choices, presets
@@ -143,6 +144,9 @@ class Config:
     """Step a uniformly random policy beside the agent, for as many env steps, and log it."""
 
     def __post_init__(self):
+        for field in dataclasses.fields(self):
+            value = _of_type(field.name, getattr(self, field.name), field.type)
+            object.__setattr__(self, field.name, value)
         _check(self)
 
     @property
@@ -204,9 +208,16 @@ def preset(name: str, **changes: Any) -> Config:
     """The config of that preset, in its environment and for its method, with changes.
 
     Raises:
-      ConfigError: an unknown preset, or a value that no run can have.
+      ConfigError: an unknown preset or setting, or a value that no run can have.
     """
     choices.check_choice("preset", name, presets.PRESETS)
+    for change in changes:
+        try:
+            choices.check_choice("setting", change, DEFAULTS)
+        except ConfigError as error:
+            raise choices.ConfigTypeError(str(error)) from None
+    choices.check_env(changes.get("env", Config.env))
+    choices.check_choice("method", changes.get("method", Config.method), choices.METHODS)
     in_env = presets.IN_ENV.get((name, changes.get("env", Config.env)), {})
     of_method = presets.OF_METHOD.get(changes.get("method", Config.method), {})
     return Config(**{"preset": name, **presets.PRESETS[name], **in_env, **of_method, **changes})
@@ -235,6 +246,9 @@ _AT_LEAST_ONE = (
     *("episode_length", "num_starts", "num_neighbors", "reference_size", "mixture_episodes"),
     *("hidden_layers", "hidden_size", "batch_size", "replay_size", "return_steps"),
 )
+# Each is a loop that is written out in the program, which grows with it.
+_UNROLLED = {"hidden_layers": 64, "num_neighbors": 256, "return_steps": 256}
+MOST = 2**31 - 1  # rows and steps are counted in 32 bits
 _POSITIVE = (
     *("updates_per_step", "torque_limit", "reward_distance", "reward_scale", "learning_rate"),
     *("soft_update_rate", "initial_temperature", "eta"),
@@ -244,6 +258,33 @@ _NOT_NEGATIVE = (
     *("seed", "plateau_segments", "plateau_tolerance", "shaping", "episodic_weight"),
     *("yaw_copies", "discount", "target_entropy_scale"),
 )
+
+
+_TYPES: dict[Any, tuple[Callable[[str, Any], Any], str]] = {
+    int: (choices.check_whole, "a whole number"),
+    float: (choices.check_number, "a number"),
+}
+
+
+def _of_type(name: str, value: Any, kind: Any) -> Any:
+    """The value as that type of Python's, also where it is numpy's or jax's.
+
+    Raises:
+      ConfigTypeError: it is no such value.
+    """
+    flag = name.replace("_", "-")
+    if kind in _TYPES:
+        convert, what = _TYPES[kind]
+        try:
+            return convert(flag, value)
+        except TypeError:
+            raise choices.ConfigTypeError(f"{flag} is {value!r}, but must be {what}.") from None
+    if kind is bool and str(getattr(value, "dtype", "")) == "bool":
+        return bool(value)
+    if not isinstance(value, kind):
+        what = "True or False" if kind is bool else "a string"
+        raise choices.ConfigTypeError(f"{flag} is {value!r}, but must be {what}.")
+    return value
 
 
 def _check(config: Config) -> None:
@@ -263,6 +304,12 @@ def _check(config: Config) -> None:
             if not holds(getattr(config, name)):
                 flag = name.replace("_", "-")
                 raise ConfigError(f"{flag} is {getattr(config, name)}, but must be {requirement}.")
+    for name in (*_AT_LEAST_ONE, "yaw_copies", "refresh_period"):
+        most = _UNROLLED.get(name, MOST)
+        if getattr(config, name) > most:
+            raise ConfigError(
+                f"{name.replace('_', '-')} is {getattr(config, name)}, but must be at most {most}."
+            )
     _check_together(config)
 
 
@@ -334,6 +381,22 @@ def _check_together(c: Config) -> None:
         (
             c.seed + c.num_seeds > 2**31,
             f"seed + num-seeds is {c.seed + c.num_seeds}, but must not exceed 2^31.",
+        ),
+        (
+            c.num_iterations * c.steps_per_iteration > MOST,
+            f"num-iterations × steps-per-iteration is {c.num_iterations * c.steps_per_iteration}, "
+            f"but must be at most {MOST}: steps are counted in 32 bits.",
+        ),
+        (
+            c.num_iterations * c.steps_per_iteration * c.updates_per_step > MOST,
+            f"num-iterations × steps-per-iteration × updates-per-step is "
+            f"{c.num_iterations * c.steps_per_iteration * c.updates_per_step:g}, but must be at "
+            f"most {MOST}: gradient steps are counted in 32 bits.",
+        ),
+        (
+            c.mixture_episodes * c.episode_length > MOST,
+            f"mixture-episodes × episode-length is {c.mixture_episodes * c.episode_length}, but "
+            f"must be at most {MOST}: states are counted in 32 bits.",
         ),
         (
             c.num_neighbors >= c.reference_size,

@@ -6,11 +6,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from maxent_jax import mixture, occupancy
+from maxent_jax import memory, mixture, occupancy
+from maxent_jax.choices import check_whole
+from maxent_jax.config import Config
 from maxent_jax.mixture import Archive
 from maxent_jax.parts import Parts
 
 EPISODES_AT_ONCE = 32
+
+
+def check(config: Config, num: int) -> None:
+    """Whether that many transitions can be collected.
+
+    Raises:
+      ValueError: num < 1, or more than fit into memory.
+    """
+    if check_whole("n", num) < 1:
+        raise ValueError(f"a dataset has at least 1 transition, not {num}")
+    memory.check_rows(config, num, "transitions")
 
 
 def collect(
@@ -40,8 +53,7 @@ def collect(
     Raises:
       ValueError: num < 1, or no episode has a first step.
     """
-    if num < 1:
-        raise ValueError(f"a dataset has at least 1 transition, not {num}")
+    check(parts.config, num)
     rows: dict[str, np.ndarray] = {}
     filled = 0
     while filled < num:

@@ -14,6 +14,7 @@ import numpy as np
 
 from maxent_jax import envs
 from maxent_jax.envs.task import observation_size
+from maxent_jax.precision import in_32_bits
 from maxent_jax.types import Features
 
 NUM_PROJECTIONS = 5
@@ -29,8 +30,17 @@ class FeatureMap:
     projection: tuple[tuple[float, ...], ...]  # [D - coordinates, 5 or 0], order 1 each
     names: tuple[str, ...]
 
+    @in_32_bits
     def __call__(self, observation: jax.Array) -> jax.Array:
-        """[..., D] -> [..., F]."""
+        """[..., D] -> [..., F].
+
+        Raises:
+          ValueError: another D than that of the environment.
+        """
+        observation = jnp.asarray(observation, jnp.float32)
+        size = len(self.coordinates) + len(self.projection)
+        if self.projection and observation.shape[-1:] != (size,):
+            raise ValueError(f"states have shape {observation.shape}, but must be [..., {size}]")
         kept = observation[..., list(self.coordinates)]
         kept = kept / jnp.broadcast_to(jnp.array(self.units), kept.shape)
         if not self.projection:
@@ -65,7 +75,7 @@ def make_feature_map(env_name: str) -> Features:
     path = resources.files("maxent_jax") / "tables" / f"features_{env_name}.json"
     if not path.is_file():
         return _default(observation_size(envs.make(env_name)))
-    table = json.loads(path.read_text())
+    table = json.loads(path.read_text(encoding="utf-8"))
     return FeatureMap(
         coordinates=tuple(table["coordinates"]),
         units=tuple(table["units"]),

@@ -15,6 +15,9 @@ PACKAGES = "libegl1 and libgl1 (egl), or libosmesa6 (osmesa)"  # Debian's and Ub
 READS_VARIABLE = "mujoco.rendering.classic.gl_context"  # once, when MuJoCo is loaded
 PROBE = """
 import mujoco
+log = mujoco.MjLogConfig.get()
+log.logto_file = False  # see envs.physics.keep_no_log
+mujoco.MjLogConfig.set(log)
 with mujoco.Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), 8, 8) as renderer:
     renderer.render()
 """
@@ -36,6 +39,14 @@ def check_drawable(env: str) -> None:
             f"environment '{env}' cannot be drawn: only MuJoCo's robots can "
             f"({', '.join(MUJOCO_ENVS)}, and user:NAME made by maxent_jax.envs.from_xml)."
         )
+
+
+def draw_nothing() -> None:
+    """For commands that draw no robots, before MuJoCo is loaded: it cannot be with a MUJOCO_GL that
+    it does not know, or whose system packages are missing.
+    """
+    if "mujoco" not in sys.modules:
+        os.environ[VARIABLE] = "disable"
 
 
 @functools.cache

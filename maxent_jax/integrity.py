@@ -61,7 +61,17 @@ def find(
         passed_over[name] = f"{sentence}."
     if passed_over:
         raise CheckpointCorruptError(f"{sentence}, and none before it is intact.")
-    raise CheckpointError(f"{run_directory} holds no complete checkpoint.")
+    check_any(run_directory)
+    return find(run_directory, whole, fallback)  # one that was saved meanwhile
+
+
+def check_any(run_directory: Path) -> None:
+    """Raises CheckpointError where the run has no checkpoint."""
+    if not checkpoints(run_directory):
+        raise CheckpointError(
+            f"{run_directory} holds no complete checkpoint: its run has not saved one yet; train "
+            f"it, with --resume if it is not running."
+        )
 
 
 def damages(run_directory: Path, name: str, whole: bool = True) -> Iterator[str]:
@@ -81,7 +91,7 @@ def seal(folder: Path) -> None:
     names = sorted(_names(folder))
     sums = "".join(f"{checksum(folder / name, to_disk=True)}  {name}\n" for name in names)
     manifest = folder / MANIFEST
-    manifest.write_text(f"{sums}# {checksum_of(sums)}\n")
+    manifest.write_text(f"{sums}# {checksum_of(sums)}\n", encoding="utf-8")
     checksum(manifest, to_disk=True)
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import optimize
 
+from maxent_jax.choices import check_number, check_whole
 from maxent_jax.sac.agent import Parameters
 
 CORRECTIVE_ROUNDS = 1000  # within log(21)/1000 = 0.003 nats for twenty-one policies
@@ -60,7 +61,7 @@ def geometric_weights(n: int, eta: float) -> np.ndarray:
     Source: Eq. 13, as in the official code of Hazan et al. 2019; see README, decision 3.
     """
     _check_count(n)
-    if not 0 < eta <= 1:
+    if not 0 < check_number("eta", eta) <= 1:
         raise ValueError(f"eta is {eta}, but must be in (0, 1]")
     return project_to_simplex((1 - eta) ** (n - np.arange(n, dtype=np.float64)))
 
@@ -79,12 +80,20 @@ def fully_corrective_weights(
     Returns:
       [n] float64, at least 0, of sum 1.
     Raises:
-      ValueError: no policies, or σ <= 0.
+      ValueError: no policies, shapes that do not match, a negative or infinite occupancy, or
+        σ <= 0.
     """
+    occupancies = np.asarray(occupancies, np.float64)
+    if occupancies.ndim != 2:
+        raise ValueError(f"occupancies have shape {occupancies.shape}, but must be [n, S]")
     n = len(occupancies)
     _check_count(n)
-    if not 0 < smoothing < np.inf:
+    if not (np.isfinite(occupancies) & (occupancies >= 0)).all():
+        raise ValueError("occupancies hold a number that is negative or not finite")
+    if not 0 < check_number("smoothing", smoothing) < np.inf:
         raise ValueError(f"smoothing is {smoothing}, but must be a positive number")
+    if start is not None and np.shape(start) != (n,):
+        raise ValueError(f"start has shape {np.shape(start)}, but must be [{n}], one a policy")
 
     def loss(weights):
         mixed = weights @ occupancies
@@ -191,5 +200,5 @@ def _inverse_cumulative(weights: jax.Array, ticks: jax.Array) -> jax.Array:
 
 
 def _check_count(n: int) -> None:
-    if n < 1:
+    if check_whole("n", n) < 1:
         raise ValueError(f"a mixture needs at least 1 policy, not {n}")

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
+from maxent_jax.choices import check_number, check_whole
 from maxent_jax.density.entropy import log_density
 from maxent_jax.density.knn import knn_distances, smallest_k
 
@@ -76,13 +77,15 @@ def knn_reward(
     Returns:
       [B] dimensionless; log(1 + R/c) by default, at least 0.
     Raises:
-      ValueError: M < k, or an unknown form.
+      ValueError: M < k, an unknown form, or a scale that is not positive.
     Source: Eq. 7; Liu & Abbeel 2021, Eq. 5. `log1p` departs from both in the 1 +.
     """
     if form not in FORMS:
         raise ValueError(f"unknown reward form '{form}': choose one of {', '.join(FORMS)}")
+    if not isinstance(scale, jax.core.Tracer) and not 0 < check_number("scale", scale) < jnp.inf:
+        raise ValueError(f"scale is {scale}, but must be a positive number")
     distance = knn_distances(features, reference, num_neighbors, exclude, count)[:, -1]
-    return of_distance(distance, form, scale, features.shape[1])
+    return of_distance(distance, form, scale, jnp.shape(features)[1])
 
 
 def hazan_reward(
@@ -174,8 +177,17 @@ def episodic_bonus(
     Returns:
       [...] the sum of the distances to the k nearest, feature units. With fewer than k earlier
       states it is k times the mean over those there are; 0 with none.
+    Raises:
+      ValueError: k < 1, or shapes that do not match.
     Source: the paper's appendix; Badia et al. 2020 (NGU).
     """
+    check_whole("num_neighbors", num_neighbors, least=1)
+    lead, dims = features.shape[:-1], features.shape[-1:]
+    if (*earlier.shape[:-2], *earlier.shape[-1:], *count.shape) != (*lead, *dims, *lead):
+        raise ValueError(
+            f"features have shape {features.shape}, earlier {earlier.shape} and count "
+            f"{count.shape}, but must be [..., F], [..., L, F] and [...]"
+        )
     squared = jnp.sum((earlier - features[..., None, :]) ** 2, axis=-1)
     filled = jax.lax.broadcasted_iota(jnp.int32, squared.shape, squared.ndim - 1) < count[..., None]
     nearest = jnp.sqrt(smallest_k(jnp.where(filled, squared, jnp.inf), num_neighbors))

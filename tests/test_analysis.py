@@ -105,7 +105,7 @@ def test_an_exported_policy_acts_without_this_package(run, visited, tmp_path):
 
 
 def test_no_such_policy_is_exported(run):
-    with pytest.raises(IndexError, match="policy 3 of a mixture of 3"):
+    with pytest.raises(IndexError, match="policy is 3, but the mixture has 3"):
         run.export_policy(3)
 
 
@@ -140,6 +140,7 @@ def test_evaluate_measures_the_gap_to_gymnasium(run, directory, capsys):
 
 def test_evaluate_says_where_gymnasium_has_no_such_environment(tmp_path):
     runs.write_config(tmp_path, preset("smoke", env="pendulum"), {}, {})
+    (tmp_path / "checkpoints" / "1").mkdir(parents=True)
     with pytest.raises(ConfigError, match="pendulum is not played in Gymnasium"):
         evaluate.main([str(tmp_path), "--gymnasium"])
 

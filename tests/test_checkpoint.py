@@ -5,13 +5,15 @@ import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import maxent_jax
-from maxent_jax import algorithm, checkpoint, integrity, runs
+from maxent_jax import algorithm, checkpoint, envs, integrity, runs
 from maxent_jax.checkpoint import Progress
 from maxent_jax.config import preset
+from maxent_jax.envs.pendulum import Pendulum
 from maxent_jax.runs import driver
 from maxent_jax.runs.interruption import Interrupted, Interruption
 
@@ -118,3 +120,51 @@ def test_the_checkpoint_of_this_release_loads(tmp_path):
         np.testing.assert_allclose(actions, expected["actions"][i], atol=1e-5)
     assert restored(directory).learner.env_steps == 400
     assert sum(path.stat().st_size for path in GOLDEN.rglob("*") if path.is_file()) < 1e6
+
+
+@jax.tree_util.register_pytree_node_class
+class Pair:
+    """A node that jax knows by a registration of its own."""
+
+    def __init__(self, left, right):
+        self.left, self.right = left, right
+
+    def tree_flatten(self):
+        return (self.left, self.right), None
+
+    @classmethod
+    def tree_unflatten(cls, _, children):
+        return cls(*children)
+
+
+class Strange(Pendulum):
+    """Whose state holds what environments of others may hold: brax's ant on MJX has no contacts,
+    an array without elements."""
+
+    def reset(self, rng):
+        info = {
+            "none": None,
+            "nothing": {},
+            "empty": jnp.zeros((0, 3)),
+            "key": jax.random.fold_in(rng, 1),
+            "a/b": {"c": jnp.ones(2, jnp.bfloat16)},
+            "a.b": (jnp.int8(3), [jnp.zeros(0, bool)], Pair(jnp.ones(1), jnp.zeros((2, 0)))),
+            "7": jnp.array(True),
+        }
+        return super().reset(rng).replace(info=info)
+
+
+def test_any_pytree_of_states_is_saved_and_comes_back(tmp_path):
+    envs.register("strange", lambda backend, physics: Strange())
+    config = preset("smoke", env="user:strange", num_iterations=1)
+    state = algorithm.start(config)
+    runs.write_config(tmp_path, config, {}, {})
+    checkpoint.save(tmp_path, state, Progress([], {}, [], {}), {})
+    back = checkpoint.restore(tmp_path, integrity.find(tmp_path)[0], config)
+    assert jax.tree.structure(back) == jax.tree.structure(state)
+    for one, other in zip(jax.tree.leaves(back), jax.tree.leaves(state), strict=True):
+        assert (one.shape, one.dtype) == (other.shape, other.dtype)
+        if jnp.issubdtype(one.dtype, jax.dtypes.prng_key):
+            one, other = jax.random.key_data(one), jax.random.key_data(other)
+        np.testing.assert_array_equal(one, other)
+    assert back.learner.episodes.env.info["empty"].shape == (4 * 2, 0, 3)

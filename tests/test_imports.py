@@ -12,8 +12,8 @@ import maxent_jax
 PACKAGE = Path(maxent_jax.__file__).parent
 # The reading order of the package, first to last.
 ORDER = [
-    *("types", "choices", "presets", "config", "convergence"),
-    *("runs", "integrity", "headless", "runtime", "native"),
+    *("types", "precision", "choices", "presets", "config", "convergence"),
+    *("runs", "integrity", "headless", "machine", "runtime", "native"),
     *("runs.interruption", "runs.locks", "runs.sinks", "runs.display", "runs.clock", "runs.hosts"),
     *("density.histogram", "density.knn", "density.sharding"),
     *("density.entropy", "density.reservoir"),
@@ -29,12 +29,21 @@ ORDER = [
     *("parts", "occupancy", "experience", "training", "algorithm"),
     *("mepol.settings", "mepol.estimates", "mepol.ascent", "mepol"),
     *("official.settings", "official.reinforce", "official.rounds", "official"),
-    *("devices", "checkpoint", "dataset", "export", "analysis", "gymnasium_play", "plotting"),
+    *(
+        "devices",
+        "memory",
+        "checkpoint",
+        "dataset",
+        "export",
+        "analysis",
+        "gymnasium_play",
+        "plotting",
+    ),
     *("theory.tabular_figures", "rendering", "film"),
     *("visual.figures", "visual.tables", "visual.video", "runs.stages", "runs.driver"),
     *("studies.statistics", "studies.protocol", "studies.raw", "studies.mepol_rows"),
     *("studies.classic_weights", "studies.paper_figures", "studies.reproduced"),
-    *("commands.cli", "commands.train", "commands.evaluate", "commands.render"),
+    *("commands.streams", "commands.cli", "commands.train", "commands.evaluate", "commands.render"),
     *("commands.report", "commands.verify", "commands.reproduce", "commands.theory"),
     *("commands", "__main__"),
 ]

@@ -371,3 +371,38 @@ def test_tracing_mjx_leaves_its_colliders_as_they_were():
         assert colliders != before
         raise RuntimeError
     assert colliders == before
+
+
+@pytest.fixture
+def log():
+    """MuJoCo's log as a new process has it, and put back afterwards."""
+    before, new = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    new.logto_file, new.logfile = True, physics.MUJOCO_LOG
+    mujoco.MjLogConfig.set(new)
+    yield new
+    mujoco.MjLogConfig.set(before)
+
+
+def diverge(model):
+    start = PhysicsState(jnp.asarray(model.qpos0), jnp.full(model.nv, 1e30), jnp.zeros(model.nv))
+    for way in (mujoco_backend.through_xla, mujoco_backend.through_python):
+        simulate = way(model, 1, ())
+        if simulate is not None:
+            jax.block_until_ready(simulate(start, jnp.zeros(model.nu)))
+
+
+def test_a_simulation_that_diverges_leaves_no_file(log, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ant = physics.load_model(physics.gymnasium_xml("ant.xml"))
+    diverge(ant)
+    assert not list(tmp_path.iterdir())
+    mujoco.MjLogConfig.set(log)  # it would have left one
+    diverge(ant)
+    assert [path.name for path in tmp_path.iterdir()] == [physics.MUJOCO_LOG]
+
+
+def test_a_log_that_the_user_chose_stays(log, tmp_path):
+    log.logfile = str(tmp_path / "mine.txt")
+    mujoco.MjLogConfig.set(log)
+    diverge(physics.load_model(physics.gymnasium_xml("ant.xml")))
+    assert (tmp_path / "mine.txt").exists()

@@ -271,6 +271,7 @@ def refused(*arguments):
 def test_an_unfinished_run_has_fewer_policies_than_planned(opengl, tmp_path, monkeypatch):
     run = untrained_run()
     runs.write_config(tmp_path, run.config, {}, {})
+    (tmp_path / "checkpoints" / "1").mkdir(parents=True)
     monkeypatch.setattr(analysis, "load_run", lambda *_: run)
     with pytest.raises(cli.UsageError, match="policies 0 to 0"):
         render.main([str(tmp_path), "--policy", "1"])

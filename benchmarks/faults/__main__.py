@@ -10,11 +10,13 @@ import tempfile
 from pathlib import Path
 
 from benchmarks import common
-from benchmarks.faults import crowd, damage, disk, inputs, numbers, saves, stops
+from benchmarks.faults import api, crowd, damage, disk, environment, inputs, numbers, saves, stops
 from maxent_jax import runtime
 
 PARTS = {
     "inputs": inputs,
+    "api": api,
+    "environment": environment,
     "stops": stops,
     "damage": damage,
     "disk": disk,

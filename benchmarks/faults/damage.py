@@ -86,7 +86,7 @@ def _flip(content: bytes, rng: random.Random) -> bytes:
 def _foreign(run: Path, latest: Path) -> Iterator[dict[str, Any]]:
     """What a hand that also wrote a manifest could do."""
     secret = run.parent / "secret"
-    secret.write_text("")
+    secret.write_text("", encoding="utf-8")
     progress = latest / "progress.json"
 
     def link(path: Path) -> None:
@@ -102,8 +102,10 @@ def _foreign(run: Path, latest: Path) -> Iterator[dict[str, Any]]:
     def seal_with(name: str) -> Callable[[], None]:
         def act() -> None:
             sums = f"{integrity.checksum(secret)}  {name}\n"
-            lines = (latest / MANIFEST).read_text().split("# ")[0] + sums
-            (latest / MANIFEST).write_text(f"{lines}# {integrity.checksum_of(lines)}\n")
+            lines = (latest / MANIFEST).read_text(encoding="utf-8").split("# ")[0] + sums
+            (latest / MANIFEST).write_text(
+                f"{lines}# {integrity.checksum_of(lines)}\n", encoding="utf-8"
+            )
 
         return act
 

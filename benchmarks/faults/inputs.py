@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from maxent_jax import runs
+from maxent_jax import integrity, runs
 from maxent_jax.config import preset
 
 SECONDS = 3.0
@@ -68,6 +68,17 @@ MISTAKES = (
     train("--out {run}", "already exists"),
     train("--out {file}", "already exists"),
     train("--out {file}/run", "cannot write"),
+    train("--out=", "out is empty"),
+    train("--num-envs 2147483648", "must be at most"),
+    train("--replay-size 4000000000", "must be at most"),
+    train("--hidden-size 100000000000000000000", "must be at most"),
+    train("--hidden-layers 1000", "hidden-layers is 1000"),
+    train("--num-neighbors 1000", "num-neighbors is 1000"),
+    train("--return-steps 1000", "return-steps is 1000"),
+    train("--num-iterations 1000000", "steps are counted in 32 bits"),
+    train("--updates-per-step 1e9", "gradient steps are counted in 32 bits"),
+    train("--mixture-episodes 100000000", "states are counted in 32 bits"),
+    train("extra", "Unrecognized options: extra"),
     train("--out {foreign} --resume", "not the directory of a run"),
     train("--out {foreign} --overwrite", "left as it is"),
     train("--out {newer} --resume", "schema 99"),
@@ -90,7 +101,18 @@ MISTAKES = (
     Mistake("experiments.report", "{run} {run}", "named twice"),
     Mistake("experiments.report", "{run} --out {missing}/page.html", "cannot write"),
     Mistake("experiments.verify", "{empty}", "not the directory of a run"),
-    Mistake("experiments.verify", "{run}", "no complete checkpoint"),
+    Mistake("experiments.verify", "{begun}", "no complete checkpoint"),
+    Mistake("experiments.evaluate", "{begun}", "no complete checkpoint"),
+    Mistake("maxent_jax", "", "name a command"),
+    Mistake("maxent_jax", "trian", "did you mean 'train'?"),
+    Mistake("maxent_jax", "--nonsense", "unknown command '--nonsense'"),
+    Mistake("maxent_jax", "verify {empty}", "not the directory of a run"),
+    Mistake("maxent_jax", "theory --tolerance 0", "--tolerance is 0"),
+    Mistake("maxent_jax", "theory --out {empty}", "is a folder"),
+    Mistake("maxent_jax", "reproduce fig9", "unknown study 'fig9'"),
+    Mistake("maxent_jax", "reproduce fig4 --scale huge", "unknown scale 'huge'"),
+    Mistake("maxent_jax", "reproduce fig4 --shard 3/2", "shard is 3/2"),
+    Mistake("maxent_jax", "reproduce fig4 --seeds 0", "seeds is 0"),
     Mistake("experiments.verify", "", "directory"),
 )
 
@@ -98,7 +120,7 @@ MISTAKES = (
 def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
     """One row; what was not met as it should be is in it."""
     places = _places(folder)
-    mistakes = MISTAKES[:: 3 if short else 1]
+    mistakes = MISTAKES[:: 20 if short else 1]
     found = [_make(mistake, places) for mistake in mistakes]
     met = zip(mistakes, found, strict=True)
     wrong = [f"{m.module} {m.arguments}: {what}" for m, (what, _) in met if what]
@@ -114,16 +136,21 @@ def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
 
 def _places(folder: Path) -> dict[str, Path]:
     """Directories, by what is wrong with them."""
-    names = ("missing", "empty", "foreign", "newer", "run", "pendulum")
+    names = ("missing", "empty", "foreign", "newer", "begun", "run", "pendulum")
     places = {name: folder / name for name in names}
     for name in names[1:]:
         places[name].mkdir()
-    (places["foreign"] / "thesis.tex").write_text("")
-    (places["newer"] / runs.CONFIG).write_text(json.dumps({"schema": 99, "config": {}}))
+    (places["foreign"] / "thesis.tex").write_text("", encoding="utf-8")
+    (places["newer"] / runs.CONFIG).write_text(
+        json.dumps({"schema": 99, "config": {}}), encoding="utf-8"
+    )
+    runs.write_config(places["begun"], preset("smoke"), {}, {})
     runs.write_config(places["run"], preset("smoke"), {}, {})
     runs.write_config(places["pendulum"], preset("smoke", env="pendulum"), {}, {})
+    for name in ("run", "pendulum"):
+        (places[name] / integrity.FOLDER / "2").mkdir(parents=True)  # saved, by its name
     places["file"] = folder / "file"
-    places["file"].write_text("")
+    places["file"].write_text("", encoding="utf-8")
     return places
 
 

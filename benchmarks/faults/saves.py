@@ -36,7 +36,7 @@ def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
 
 
 def _used(folder: Path) -> dict[str, float]:
-    with open("/proc/self/statm") as file:
+    with open("/proc/self/statm", encoding="utf-8") as file:
         resident = int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     files = [path for path in folder.rglob("*") if path.is_file()]
     return {

@@ -20,6 +20,12 @@ def command(directory: Path, *flags: str) -> list[str]:
     return [sys.executable, "-m", "experiments.train", *SMOKE, "--out", str(directory), *flags]
 
 
+def train_pendulum(directory: Path) -> None:
+    """A run that takes seconds, to its end."""
+    small = ("train", "--preset", "smoke", "--env", "pendulum", "--out", str(directory))
+    subprocess.run([sys.executable, "-m", "maxent_jax", *small], capture_output=True, check=True)
+
+
 def start(directory: Path, *flags: str) -> subprocess.Popen[str]:
     """A smoke run in a process of its own."""
     return subprocess.Popen(
@@ -55,7 +61,7 @@ def same(one: Path, other: Path) -> bool:
 
 def timeless(directory: Path) -> list[dict[str, Any]]:
     """The lines of metrics.jsonl without what the clock has a part in."""
-    lines = (directory / runs.METRICS).read_text().splitlines()
+    lines = (directory / runs.METRICS).read_text(encoding="utf-8").splitlines()
     assert len(lines) == len(runs.read_metrics(directory)), "an unfinished line"
     rows = runs.read_metrics(directory)
     return [{k: v for k, v in row.items() if not k.startswith("wall_")} for row in rows]

@@ -19,7 +19,7 @@ def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
     shutil.rmtree(undisturbed)
     seconds = smoke.finish(undisturbed)
     instants = random.Random(0)
-    counts = {signal.SIGKILL: 50, signal.SIGTERM: 5, signal.SIGINT: 5}
+    counts = {signal.SIGKILL: 50, signal.SIGTERM: 5, signal.SIGINT: 5, signal.SIGHUP: 5}
     for number, count in counts.items():
         times = 1 if short else count
         trials = [

@@ -3,7 +3,12 @@
 import functools
 import importlib
 import io
+import logging
+import os
+import re
+import shutil
 import sys
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr
 from pathlib import Path
@@ -12,10 +17,22 @@ from typing import Any, TypeVar
 import tyro
 
 from maxent_jax.choices import ConfigError, UsageError
+from maxent_jax.commands import streams
+from maxent_jax.commands.streams import OutputError
 from maxent_jax.runs import NonFiniteError, RunError, SaveError
 from maxent_jax.runs.interruption import Interrupted
 
+NARROWEST = 40  # columns
 Arguments = TypeVar("Arguments")
+COMMANDS = {
+    "train": "train a mixture of policies that covers the state space",
+    "evaluate": "roll a run's mixture out anew: entropy, coverage, returns",
+    "render": "film a run's policies",
+    "report": "one HTML page about one or several runs",
+    "verify": "is every file of a run's checkpoints what was written?",
+    "reproduce": "the paper's figures, and the studies beside them",
+    "theory": "the methods against their bounds, exactly, in tabular MDPs",
+}
 
 
 def run(name: str) -> None:
@@ -77,27 +94,87 @@ def flag_value(argv: Sequence[str], flag: str) -> str | None:
 def entry_point(main: Callable[[Sequence[str]], None]) -> Callable[[Sequence[str]], None]:
     """A main that ends with one sentence where it can't go on.
 
-    Exit code 2 for a user's mistake, 1 for what the machine or the numbers did.
+    Exit code 2 for a user's mistake, 1 for what the machine or the numbers did, 128 + N for a
+    signal N; 141 (SIGPIPE) where the reader of standard output has gone.
     """
 
     @functools.wraps(main)
     def run(argv: Sequence[str]) -> None:
+        streams.settle()
+        _settle_other_packages()
         try:
-            main(argv)
-        except (UsageError, ConfigError, RunError) as mistake:
-            print(f"error: {mistake}", file=sys.stderr)
-            sys.exit(2)
-        except (SaveError, NonFiniteError) as failure:
-            print(f"error: {failure}", file=sys.stderr)
-            sys.exit(1)
-        except Interrupted as stop:
-            print(stop, file=sys.stderr)
-            sys.exit(stop.exit_code)
-        except KeyboardInterrupt:
-            print("interrupted", file=sys.stderr)
-            sys.exit(130)
+            code = _exit_code(main, argv)
+            streams.finish()
+        except OutputError as error:
+            code = streams.exit_code(error)
+        if code:
+            sys.exit(code)
 
     return run
+
+
+def _exit_code(main: Callable[[Sequence[str]], None], argv: Sequence[str]) -> int:
+    try:
+        main(argv)
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else 0
+    except Interrupted as stop:
+        print(stop, file=sys.stderr)
+        return stop.exit_code
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except OutputError:
+        raise
+    except Exception as error:
+        code, sentence = _explained(error)
+        print(f"error: {sentence}", file=sys.stderr)
+        return code
+    return 0
+
+
+def _explained(error: Exception) -> tuple[int, str]:
+    """The exit code and the sentence; what no user can cause is raised again."""
+    if isinstance(error, UsageError | ConfigError | RunError):
+        return 2, one_line(error)
+    if isinstance(error, SaveError | NonFiniteError):
+        return 1, one_line(error)
+    if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error):
+        return 1, (
+            f"out of memory{_asked_for(error)}: choose a smaller replay-size, num-envs, "
+            f"hidden-size, reference-size or mixture-episodes; what was saved before is intact."
+        )
+    if isinstance(error, OSError):
+        where = "" if error.filename is None else f": {error.filename}"
+        return 1, f"{error.strerror or one_line(error)}{where}."
+    if type(error).__name__ == "JaxRuntimeError":  # whose module need not be loaded
+        return 1, f"jax cannot go on: {one_line(error)[:500]}"
+    raise error
+
+
+def one_line(error: Exception) -> str:
+    """The message, also where what it quotes has line breaks."""
+    return re.sub(r"\s*\n\s*", " ", str(error)).strip()
+
+
+def _asked_for(error: Exception) -> str:
+    asked = re.search(r"allocat\w+ (?:an array with .*|[\d.]+ ?\w+)", str(error))
+    return f" ({asked[0].rstrip('.')})" if asked else ""
+
+
+def _settle_other_packages() -> None:
+    """Keeps a user's settings for other programs from ending every command.
+
+    Packages warn when they are imported, which -W error makes an exception. Matplotlib refuses to
+    be imported with an MPLBACKEND that it does not know, and talks of its own cache folder; figures
+    here need neither. Tyro does not end its help in a terminal of a few columns.
+    """
+    if shutil.get_terminal_size().columns < NARROWEST:
+        os.environ["COLUMNS"] = str(NARROWEST)
+    os.environ["MPLBACKEND"] = "agg"
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    if any(option.startswith("error") for option in sys.warnoptions):
+        warnings.simplefilter("ignore")
 
 
 def _sentence(panel: str) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from maxent_jax import runs
+from maxent_jax import headless, integrity, runs, runtime
 from maxent_jax.commands import cli
 
 if TYPE_CHECKING:
@@ -42,9 +42,10 @@ def main(argv: Sequence[str]) -> None:
     if arguments.episodes < 1 or arguments.seed < 0:
         raise cli.UsageError("--episodes must be at least 1, and --seed 0 or more.")
     config = runs.read_config(arguments.directory)
-    from maxent_jax import runtime
-
-    runtime.prepare(config.simulates_in_jax)
+    integrity.check_any(arguments.directory)
+    runs.check_writable(arguments.directory)
+    headless.draw_nothing()
+    runtime.start(config.simulates_in_jax)
     if arguments.gymnasium:
         from maxent_jax import gymnasium_play
 

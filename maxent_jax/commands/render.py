@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from maxent_jax import headless, runs
+from maxent_jax import headless, integrity, runs, runtime
 from maxent_jax.commands import cli
 from maxent_jax.runs import display
 from maxent_jax.visual import video
@@ -61,9 +61,9 @@ def main(argv: Sequence[str]) -> None:
     headless.check_drawable(config.env)
     video.check()
     headless.choose_backend()
-    from maxent_jax import runtime
-
-    runtime.prepare(config.simulates_in_jax)
+    integrity.check_any(arguments.directory)
+    runs.check_writable(arguments.directory)
+    runtime.start(config.simulates_in_jax)
     _film(arguments)
 
 

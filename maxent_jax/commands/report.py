@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from maxent_jax import runs
+from maxent_jax import headless, integrity, runs, runtime
 from maxent_jax.commands import cli, render
 from maxent_jax.runs import display
 
@@ -50,9 +50,10 @@ def main(argv: Sequence[str]) -> None:
     arguments = cli.parse(Arguments, argv, "report")
     configs = [runs.read_config(directory) for directory in arguments.directories]
     path = _check(arguments)
-    from maxent_jax import runtime
-
-    runtime.prepare(any(config.simulates_in_jax for config in configs))
+    for directory in arguments.directories:
+        integrity.check_any(directory)
+    headless.draw_nothing()
+    runtime.start(any(config.simulates_in_jax for config in configs))
     page = make(arguments)
     with runs.whole_file(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
@@ -72,6 +73,7 @@ def _check(arguments: Arguments) -> Path:
     path = arguments.out or here / "report.html"
     if path.is_dir() or not path.parent.is_dir():
         raise cli.UsageError(f"cannot write to {path}: --out must name a file in a directory.")
+    runs.check_writable(path.parent)
     return path
 
 
@@ -116,7 +118,7 @@ def _run_section(name: str, seeds: Sequence["Run"]) -> dict[str, Any]:
     from maxent_jax.visual import tables
 
     config = seeds[0].config
-    content = json.loads((seeds[0].path / runs.CONFIG).read_text())
+    content = json.loads((seeds[0].path / runs.CONFIG).read_text(encoding="utf-8"))
     return {
         "name": name,
         "config": config,

@@ -18,11 +18,11 @@ from typing import Annotated
 
 import tyro
 
-from maxent_jax import runs
+from maxent_jax import headless, runs, runtime
 from maxent_jax.choices import check_choice
 from maxent_jax.commands import cli, train
 from maxent_jax.runs import locks
-from maxent_jax.runs.interruption import SIGNALS
+from maxent_jax.runs.interruption import heeded
 from maxent_jax.studies import protocol
 from maxent_jax.studies.protocol import Cell
 
@@ -63,7 +63,9 @@ def main(argv: Sequence[str]) -> None:
     whats = tuple(FIGURES) if arguments.what == "all" else (arguments.what,)
     names = dict.fromkeys(name for what in whats for name in FIGURES.get(what, (what,)))
     studies = {name: protocol.make(name, arguments.scale, arguments.seeds) for name in names}
+    headless.draw_nothing()
     if "fig3" in whats:
+        runtime.prepare(simulates_in_jax=False)
         from maxent_jax.studies import classic_weights  # loads jax
 
         classic_weights.held(arguments.out / "fig3", arguments.scale, arguments.seeds)
@@ -89,10 +91,9 @@ def main(argv: Sequence[str]) -> None:
     if left and arguments.figures:
         print(f"{len(left)} cells are not finished, {left[0]} the first: no figures yet.")
     elif arguments.figures:
-        from maxent_jax import runtime
         from maxent_jax.studies import reproduced  # loads jax
 
-        runtime.prepare(simulates_in_jax=False)
+        runtime.start(simulates_in_jax=False)
         reproduced.draw(whats, arguments.scale, arguments.seeds, arguments.out, studies)
 
 
@@ -127,6 +128,7 @@ def _train(directory: Path, cells: Sequence[Cell]) -> int:
             if protocol.finished(directory, cell):
                 continue
             at = protocol.home(directory, cell)
+            runtime.prepare(cell.config.simulates_in_jax)
             with train.claimed(train.Arguments(cell.config, out=at, resume=True)):
                 from maxent_jax.runs import driver  # loads jax
 
@@ -144,7 +146,7 @@ def _share(arguments: Arguments) -> None:
 
     What this process is told by a signal, it tells them; they save themselves.
     """
-    command = [sys.executable, "-m", "reproduce", arguments.what, "--no-figures"]
+    command = [sys.executable, "-m", "maxent_jax", "reproduce", arguments.what, "--no-figures"]
     for name in ("scale", "out", "seeds", "shard"):
         value = getattr(arguments, name)
         command += [] if value is None else [f"--{name}", str(value)]
@@ -155,7 +157,7 @@ def _share(arguments: Arguments) -> None:
         for process in processes:
             process.send_signal(number)
 
-    handlers = [signal.signal(number, tell) for number in SIGNALS]
+    handlers = {number: signal.signal(number, tell) for number in heeded()}
     try:
         for i in range(arguments.jobs):
             # In a group of its own, so that Ctrl-C reaches it once.
@@ -164,7 +166,7 @@ def _share(arguments: Arguments) -> None:
                 os.sched_setaffinity(processes[-1].pid, cores[i :: arguments.jobs] or cores)
         codes = [process.wait() for process in processes]
     finally:
-        for number, handler in zip(SIGNALS, handlers, strict=True):
+        for number, handler in handlers.items():
             signal.signal(number, handler)
     worst = max(code if code >= 0 else 128 - code for code in codes)
     if worst:

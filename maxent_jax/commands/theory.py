@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from maxent_jax import runs
+from maxent_jax import headless, runs, runtime
 from maxent_jax.commands import cli
 from maxent_jax.runs import display
 
@@ -50,9 +50,8 @@ class Arguments:
 def main(argv: Sequence[str]) -> None:
     """Parses and checks, and only then computes."""
     arguments = _check(cli.parse(Arguments, argv, "theory"))
-    from maxent_jax import runtime
-
-    runtime.prepare(simulates_in_jax=False)
+    headless.draw_nothing()
+    runtime.start(simulates_in_jax=False)
     results = runs.jsonable(study(arguments))
     from maxent_jax.theory import tabular_figures
 

@@ -6,6 +6,7 @@ figures/. `--resume` goes on from the last complete checkpoint.
 
 import contextlib
 import dataclasses
+import os
 import re
 import shlex
 import shutil
@@ -13,14 +14,12 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from maxent_jax import runs
-from maxent_jax.commands import COMMANDS, cli
+from maxent_jax import headless, integrity, runs, runtime
+from maxent_jax.commands import cli
 from maxent_jax.config import Config, preset
-from maxent_jax.runs import display, locks
+from maxent_jax.runs import locks
+from maxent_jax.runs.sinks import FOLDERS as SINKS
 from maxent_jax.runs.sinks import Sinks
-
-# By whether jax simulates too; two CPU cores, with AVX-512 and without.
-COMPILING = {False: "15 to 50 s", True: "1 to 3 minutes"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +67,8 @@ def read_arguments(argv: Sequence[str]) -> Arguments:
     Raises:
       UsageError, ConfigError, RunError: one sentence each.
     """
+    if cli.flag_value(argv, "--out") == "":
+        raise cli.UsageError("out is empty: name a directory, or leave --out away.")
     default = Arguments(_default_config(argv))
     arguments = cli.parse(Arguments, argv, "train", default=default)
     _check_saving(arguments)
@@ -105,17 +106,18 @@ def claimed(arguments: Arguments) -> Iterator[None]:
 
 
 def check_free(arguments: Arguments) -> None:
-    """Whether the directory is not there or empty, or holds a run that the arguments deal with.
+    """Whether the directory is not there or nobody's, or holds a run that the arguments deal with.
 
     Raises:
       UsageError, RunError: it does not.
     """
     directory = arguments.directory
-    taken = directory.is_file() or (
-        directory.is_dir() and not locks.is_free(directory, runs.CONFIG)
-    )
-    if not taken:
-        return
+    try:
+        _check_writable(directory)
+        if not directory.exists() or (directory.is_dir() and _is_nobodys(directory)):
+            return
+    except OSError as error:
+        raise cli.UsageError(f"cannot write to {directory}: {error.strerror}.") from None
     if arguments.resume:
         runs.check_config(directory, arguments.config)
     elif not arguments.overwrite:
@@ -123,8 +125,43 @@ def check_free(arguments: Arguments) -> None:
             f"{directory} already exists: choose another --out, or add --resume to go on with it "
             f"or --overwrite to begin anew."
         )
-    elif not (directory / runs.CONFIG).is_file():
+    elif not runs.is_config(directory / runs.CONFIG):
         raise cli.UsageError(f"{directory} is not the directory of a run: it is left as it is.")
+
+
+def _check_writable(directory: Path) -> None:
+    """Raises UsageError where the directory cannot be made, or nothing be written into it."""
+    place = next(p for p in (directory, *directory.absolute().parents) if os.path.lexists(p))
+    if place.is_symlink() and not place.exists():
+        raise cli.UsageError(f"cannot write to {directory}: {place} is a link to nowhere.")
+    if not place.is_dir() and place != directory:
+        raise cli.UsageError(f"cannot write to {directory}: {place} is no directory.")
+    if place.is_dir() and not os.access(place, os.W_OK | os.X_OK):
+        raise cli.UsageError(f"cannot write to {directory}: {place} is not writable.")
+
+
+def _is_nobodys(directory: Path) -> bool:
+    """Whether it holds no more than what a run leaves that ended before its first checkpoint."""
+    if integrity.checkpoints(directory):
+        return False
+    return all(_is_of_a_beginning(path) for path in directory.iterdir())
+
+
+def _is_of_a_beginning(path: Path) -> bool:
+    directory = path.parent
+    if path.name == runs.CONFIG and path.is_file():
+        return runs.is_config(path)
+    if path.name == runs.METRICS:
+        return path.is_file() and path.stat().st_size == 0
+    if path.name == integrity.FOLDER:
+        unfinished = path.is_dir() and all(
+            inside.name.startswith(integrity.UNFINISHED) for inside in path.iterdir()
+        )
+        return unfinished and not path.is_symlink()
+    temporary = {runs.temporary_of(directory / name).name for name in (runs.CONFIG, runs.METRICS)}
+    if path.name in SINKS:
+        return (directory / runs.CONFIG).is_file()
+    return path.name in {locks.LOCK, *temporary}
 
 
 def _remove_run(directory: Path) -> None:
@@ -197,51 +234,34 @@ def main(argv: Sequence[str]) -> None:
     """Parses, checks, and only then loads jax."""
     started = time.perf_counter()
     arguments = read_arguments(argv)
-    num_devices = arguments.devices
+    config, num_devices = arguments.config, arguments.devices
+    check_free(arguments)
+    headless.draw_nothing()
+    load = runtime.prepare if arguments.coordinator else runtime.start
+    load(config.simulates_in_jax)
+    from maxent_jax.runs import driver, hosts  # loads jax
+
     holding: contextlib.AbstractContextManager[None] = claimed(arguments)
     if arguments.coordinator:
-        from maxent_jax import runtime
-        from maxent_jax.runs import hosts  # loads jax
-
-        runtime.prepare(arguments.config.simulates_in_jax)  # before the first computation
         hosts.join(arguments.coordinator, arguments.num_processes, arguments.process_id)
         check_free(arguments)  # by all, so that all end where it is taken
         hosts.wait_for_all("checked")
         num_devices = 0
         if not hosts.is_first():
             holding = contextlib.nullcontext()
-    first = arguments.process_id == 0
+    options = driver.Options(
+        num_devices,
+        arguments.fallback,
+        arguments.save_iterations,
+        arguments.save_minutes,
+        Sinks(arguments.tensorboard, arguments.wandb),
+    )
+    driver.check(config, options)  # before there is a directory
     with holding:
-        if first:
-            _announce(arguments)
-        from maxent_jax.runs import driver, hosts  # loads jax
-
         hosts.wait_for_all("claimed")
-        options = driver.Options(
-            num_devices,
-            arguments.fallback,
-            arguments.save_iterations,
-            arguments.save_minutes,
-            Sinks(arguments.tensorboard, arguments.wandb),
-        )
-        driver.train(arguments.config, arguments.directory, started, options)
-    if first:
+        driver.train(config, arguments.directory, started, options)
+    if hosts.is_first():
         _point_onward(arguments.directory)
-
-
-def _announce(arguments: Arguments) -> None:
-    """What is about to happen, before the libraries are loaded."""
-    c = arguments.config
-    env_steps = c.num_seeds * c.num_iterations * c.steps_per_iteration
-    seeds = (
-        f"seed {c.seed}" if c.num_seeds == 1 else f"seeds {c.seed} to {c.seed + c.num_seeds - 1}"
-    )
-    display.say(
-        f"{c.method} on {c.env}, preset {c.preset}, {seeds}: {c.num_iterations} iterations, "
-        f"{env_steps:,} environment steps, into {arguments.directory}\n"
-        f"compiling: {COMPILING[c.simulates_in_jax]} the first time, less with a warm cache; "
-        f"Ctrl-C saves the run"
-    )
 
 
 def _point_onward(directory: Path) -> None:
@@ -249,4 +269,4 @@ def _point_onward(directory: Path) -> None:
     what = shlex.quote(str(directory))
     print("next:")
     for name in ("evaluate", "render", "report"):
-        print(f"  {cli.spelled(name) + ' ' + what:60} # {COMMANDS[name]}")
+        print(f"  {cli.spelled(name) + ' ' + what:60} # {cli.COMMANDS[name]}")

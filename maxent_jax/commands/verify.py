@@ -27,10 +27,8 @@ def main(argv: Sequence[str]) -> None:
     """Loads no array library."""
     directory = cli.parse(Arguments, argv, "verify").directory
     runs.read_config(directory)
-    names = integrity.checkpoints(directory)
-    if not names:
-        raise runs.CheckpointError(f"{directory} holds no complete checkpoint.")
-    if not verify(directory, names):
+    integrity.check_any(directory)
+    if not verify(directory, integrity.checkpoints(directory)):
         sys.exit(1)
 
 

@@ -2,8 +2,10 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.special import digamma, gammaln
 
+from maxent_jax.choices import check_whole
 from maxent_jax.density.knn import knn_distances
 
 
@@ -30,11 +32,12 @@ def knn_density(
 
     Source: Eq. 9. A query that names a point to exclude has one neighbour fewer to find.
     """
-    num_points = jnp.asarray(points.shape[0], jnp.float32)
-    if exclude is not None:
-        num_points = num_points - (exclude >= 0)
     distance = knn_distances(queries, points, k, exclude)[:, -1]
-    return jnp.exp(log_density(distance, num_points, k, points.shape[1]))
+    num_points, dims = np.shape(points)
+    others = jnp.asarray(num_points, jnp.float32)
+    if exclude is not None:
+        others = others - (jnp.asarray(exclude) >= 0)
+    return jnp.exp(log_density(distance, others, k, dims))
 
 
 def knn_entropy(samples: jax.Array, k: int, labels: jax.Array | None = None) -> jax.Array:
@@ -47,12 +50,18 @@ def knn_entropy(samples: jax.Array, k: int, labels: jax.Array | None = None) -> 
     Returns:
       [] nats; -inf where k or more samples coincide with another one.
     Raises:
-      ValueError: N <= k.
+      ValueError: N <= k, or as knn_distances.
+      TypeError: as knn_distances.
     Source: Eq. 6, with its bias correction log k - ψ(k) (Kozachenko & Leonenko 1987).
     """
-    num_samples, dims = samples.shape
+    check_whole("k", k)
+    if np.ndim(samples) != 2:
+        raise ValueError(f"samples have shape {np.shape(samples)}, but must be [N, F]")
+    num_samples, dims = np.shape(samples)
     if num_samples <= k:
         raise ValueError(f"{num_samples} samples are too few for {k} neighbours")
     labels = jnp.arange(num_samples, dtype=jnp.int32) if labels is None else labels
+    if np.shape(labels) != (num_samples,):
+        raise ValueError(f"labels have shape {np.shape(labels)}, but must be [{num_samples}]")
     distance = knn_distances(samples, samples, k, exclude=labels, labels=labels)[:, -1]
     return jnp.mean(-log_density(distance, num_samples - 1, k, dims)) + jnp.log(k) - digamma(k)

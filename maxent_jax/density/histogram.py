@@ -38,8 +38,21 @@ def count(states: jax.Array, grid: Grid, weights: jax.Array | None = None) -> ja
       weights: [B] int or float, what each state counts; 1 when left out.
     Returns:
       [bins, bins] in the weights' dtype, else int32. States off the grid, and NaN, are dropped.
+    Raises:
+      ValueError: shapes that do not match the grid or each other.
+      TypeError: no grid.
     """
-    weights = jnp.ones(states.shape[0], jnp.int32) if weights is None else weights
+    if not isinstance(grid, Grid):
+        raise TypeError(f"grid is {grid!r}, but must be a density.histogram.Grid")
+    states = jnp.asarray(states)
+    if states.ndim != 2 or (grid.transform is None and states.shape[1] <= max(grid.coordinates)):
+        raise ValueError(
+            f"states have shape {states.shape}, but must be [B, D] with the coordinates "
+            f"{grid.coordinates} of the grid"
+        )
+    weights = jnp.ones(states.shape[0], jnp.int32) if weights is None else jnp.asarray(weights)
+    if weights.shape != states.shape[:1]:
+        raise ValueError(f"weights have shape {weights.shape}, but must be [{states.shape[0]}]")
     counts = jnp.zeros(grid.num_cells, weights.dtype)
     return counts.at[cells(states, grid)].add(weights, mode="drop").reshape(grid.bins)
 
@@ -57,11 +70,12 @@ def cells(states: jax.Array, grid: Grid) -> jax.Array:
 
 def coverage(counts: jax.Array) -> jax.Array:
     """[] int32: cells visited at least once."""
-    return jnp.sum(counts > 0, dtype=jnp.int32)
+    return jnp.sum(jnp.asarray(counts) > 0, dtype=jnp.int32)
 
 
 def shannon_entropy(counts: jax.Array) -> jax.Array:
     """[] nats: entropy of the cells' visit frequencies, at most log(number of cells); 0 if none."""
+    counts = jnp.asarray(counts)
     total = jnp.sum(counts)
     frequency = counts / jnp.where(total > 0, total, 1)
     return -jnp.sum(jnp.where(counts > 0, frequency * jnp.log(jnp.maximum(frequency, 1e-38)), 0.0))

@@ -6,12 +6,14 @@ in XLA, by blocks of points for CPUs and by one reduction for GPUs.
 """
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from maxent_jax import native
+from maxent_jax.choices import check_whole
 
 NONE_EXCLUDED = -1
 # Points handled at once, unrolled. Measured on two cores with AVX-512 inside a scan: few queries
@@ -37,8 +39,8 @@ def knn_distances(
     Usable inside jit, scan and vmap; not differentiable. Memory grows with B + M, not with B × M.
 
     Args:
-      queries: [B, F] float32.
-      points: [M, F] float32, same units.
+      queries: [B, F] float32; other floats are searched more slowly.
+      points: [M, F], same units and dtype.
       k: neighbours wanted.
       exclude: [B] int, the label of the points that a query must not see, -1 for none. It is how
         a query that is itself a point leaves itself out, also where others share its place.
@@ -50,16 +52,24 @@ def knn_distances(
       query that is not finite gets NaN.
     Raises:
       ValueError: k < 1, k > M, sizes that do not match, or concrete input that is not finite.
+      TypeError: input that is no array of real numbers, or labels that are not whole ones.
     """
+    queries, points, k = _floats("queries", queries), _floats("points", points), check_whole("k", k)
     _check(queries, points, k, count)
+    queries, points = jnp.asarray(queries), jnp.asarray(points)
+    dtype = jnp.promote_types(queries.dtype, points.dtype)
+    queries, points = queries.astype(dtype), points.astype(dtype)
     num_queries, num_points = queries.shape[0], points.shape[0]
-    exclude = jnp.full(num_queries, NONE_EXCLUDED, jnp.int32) if exclude is None else exclude
-    labels = jnp.arange(num_points, dtype=jnp.int32) if labels is None else labels
-    count = jnp.asarray(num_points if count is None else count, jnp.int32)
-    single = queries.dtype == points.dtype == jnp.float32
-    on_cpu = in_cpp if single and native.library() else by_blocks
+    if exclude is None:
+        exclude = jnp.full(num_queries, NONE_EXCLUDED, jnp.int32)
+    if labels is None:
+        labels = jnp.arange(num_points, dtype=jnp.int32)
+    exclude = _whole_numbers("exclude", exclude, (num_queries,))
+    labels = _whole_numbers("labels", labels, (num_points,))
+    count = _whole_numbers("count", num_points if count is None else count, ())
+    on_cpu = in_cpp if dtype == jnp.float32 and native.library() else by_blocks
     return jax.lax.platform_dependent(
-        *(jnp.asarray(queries), jnp.asarray(points), exclude, labels, count),
+        *(queries, points, exclude, labels, count),
         cpu=functools.partial(on_cpu, k),
         cuda=functools.partial(by_reduction, k),
         rocm=functools.partial(by_reduction, k),
@@ -190,14 +200,50 @@ def smallest_k(values: jax.Array, k: int) -> jax.Array:
     return jnp.stack(found, axis=-1)
 
 
+def _floats(name: str, values: Any) -> Any:
+    """The values as an array of floats: numpy's or jax's, as it was given."""
+    values = _array(name, values)
+    if jnp.issubdtype(values.dtype, jnp.integer) or values.dtype == bool:
+        return values.astype(jnp.float32)
+    if not jnp.issubdtype(values.dtype, jnp.floating):
+        raise TypeError(f"{name} have dtype {values.dtype}, but must be real numbers")
+    return values
+
+
+def _whole_numbers(name: str, values: Any, shape: tuple[int, ...]) -> jax.Array:
+    values = _array(name, values)
+    if not jnp.issubdtype(values.dtype, jnp.integer):
+        raise TypeError(f"{name} is of dtype {values.dtype}, but must be whole numbers")
+    if values.shape != shape:
+        raise ValueError(f"{name} has shape {values.shape}, but must be {shape}")
+    return jnp.asarray(values, jnp.int32)
+
+
+def _array(name: str, values: Any) -> Any:
+    if isinstance(values, jax.Array | np.ndarray):
+        return values
+    try:
+        array = np.asarray(values)
+    except ValueError as error:  # rows of different lengths
+        raise TypeError(f"{name} cannot be made an array: {error}") from None
+    if array.dtype == np.float64:  # Python's floats, which jax takes for float32 as well
+        return array.astype(np.float32)
+    if not (np.issubdtype(array.dtype, np.number) or array.dtype == bool):
+        raise TypeError(f"{name} holds {array.dtype}, but must be an array of numbers")
+    return array
+
+
 def _check(queries, points, k, count) -> None:
     if queries.ndim != 2 or points.ndim != 2 or queries.shape[1] != points.shape[1]:
         raise ValueError(
-            f"queries {queries.shape} and points {points.shape} must be [B, F] and [M, F]"
+            f"queries have shape {queries.shape} and points {points.shape}, but must be [B, F] and "
+            f"[M, F]"
         )
     available = points.shape[0]
     if count is not None and not isinstance(count, jax.core.Tracer):
-        available = min(available, int(count))
+        if check_whole("count", count) > available:
+            raise ValueError(f"count is {count}, but there are {available} points")
+        available = int(count)
     if not 1 <= k <= available:
         raise ValueError(f"k is {k}, but must be from 1 to the number of points, {available}")
     for name, value in (("queries", queries), ("points", points)):

@@ -7,6 +7,7 @@ brax's, or `user:NAME` for one that `register` was told of.
 import contextlib
 import functools
 import io
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +20,15 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an optio
 from brax import envs as brax_envs
 from brax.envs.base import Env
 
-from maxent_jax.choices import ConfigError, check_env, check_physics
+from maxent_jax.choices import (
+    ConfigError,
+    ConfigTypeError,
+    check_env,
+    check_number,
+    check_path,
+    check_physics,
+    check_whole,
+)
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import ant, humanoid, mountain_car, pendulum, walker2d
 from maxent_jax.envs.physics import REFERENCE, Options, PhysicsState
@@ -32,6 +41,7 @@ CLASSIC = {
     "pendulum": (pendulum.Pendulum, pendulum.GRID),
     "mountain_car": (mountain_car.MountainCar, mountain_car.GRID),
 }
+DEVIATIONS = ("torque_limit", "end_flipped", "end_unhealthy")  # of MujocoEnv
 BRAX_HIDES_POSITION = ("ant", "halfcheetah", "hopper", "humanoid", "swimmer", "walker2d")
 DEFAULT_GRID = Grid(
     names=("state 0", "state 1"), low=(-10.0, -10.0), high=(10.0, 10.0), bins=(100, 100)
@@ -61,9 +71,16 @@ def make(name: str, backend: str = "auto", physics: str = "reference", **deviati
       **deviations: from Gymnasium's task, see MujocoEnv.
     Raises:
       ConfigError (a ValueError): an unknown name, backend or physics, or one that cannot run here.
+      ConfigTypeError (a TypeError as well): an unknown deviation.
     """
     found = entry(name)
     check_physics(name, backend, physics)
+    known = DEVIATIONS if name in TASKS else ()
+    for deviation in deviations:
+        if deviation not in known:
+            raise ConfigTypeError(
+                f"{name} has no deviation '{deviation}': it has {', '.join(known) or 'none'}."
+            )
     return found.make(backend, physics, **deviations)
 
 
@@ -80,7 +97,7 @@ def entry(name: str) -> Entry:
     if kind == "user":
         if name not in _registered:
             raise ConfigError(
-                f"environment '{name}' is not registered: call maxent_jax.envs.register first"
+                f"environment '{name}' is not registered: call maxent_jax.envs.register first."
             )
         return _registered[name]
     if name in TASKS:
@@ -104,7 +121,23 @@ def register(
       grid: where coverage is measured; by default the first two observations, within ±10.
       phi: the feature map, [..., D] -> [..., F], with `.names`; by default the first two
         observations and five random projections of the others.
+    Raises:
+      ConfigTypeError (a ValueError and a TypeError): an argument that is no such thing.
     """
+    for wrong, sentence in (
+        (
+            not isinstance(name, str) or not name,
+            f"the environment's name is {name!r}, but must be a string that is not empty.",
+        ),
+        (not callable(make), f"make is {make!r}, but must be a function that makes a brax Env."),
+        (not isinstance(grid, Grid), f"grid is {grid!r}, but must be a density.histogram.Grid."),
+        (
+            phi is not None and not (callable(phi) and hasattr(phi, "names")),
+            f"phi is {phi!r}, but must be a function with `names`.",
+        ),
+    ):
+        if wrong:
+            raise ConfigTypeError(sentence)
     _registered[f"user:{name}"] = Entry(make, grid, None, phi)
 
 
@@ -119,16 +152,22 @@ def from_xml(
     """An environment of any MJCF file: it observes qpos and qvel, and acts by its controls.
 
     Args:
-      frame_skip: the file's physics steps in a control step.
+      frame_skip: the file's physics steps in a control step, at least 1.
       reset_noise: half the range of the noise in every coordinate of a start.
       healthy: observation [..., D] -> [...] bool, false ends an episode; by default only numbers
         that are not finite do.
     Raises:
       ConfigError: MuJoCo cannot read the file, or the backend cannot simulate it.
+      TypeError: an argument of the wrong type.
     """
+    path = check_path("xml", xml)
+    if check_whole("frame_skip", frame_skip) < 1:
+        raise ConfigError(f"frame_skip is {frame_skip}, but must be at least 1.")
+    if not 0 <= check_number("reset_noise", reset_noise) < float("inf"):
+        raise ConfigError(f"reset_noise is {reset_noise}, but must be 0 or more.")
     task = Task(
-        name=Path(xml).stem,
-        xml=Path(xml),
+        name=path.stem,
+        xml=path,
         frame_skip=frame_skip,
         reset=uniform_reset(reset_noise),
         observe=_qpos_and_qvel,
@@ -154,4 +193,6 @@ def _make_brax(name: str, backend: str, _physics: str) -> Env:
     options: dict[str, Any] = {} if backend == "auto" else {"backend": backend}
     if name in BRAX_HIDES_POSITION:
         options["exclude_current_positions_from_observation"] = False
-    return brax_envs.get_environment(name, **options)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Brax System")  # that MJX is better kept
+        return brax_envs.get_environment(name, **options)

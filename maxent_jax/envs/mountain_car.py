@@ -15,6 +15,7 @@ from brax.envs.base import Env, State
 
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs.task import check_action
+from maxent_jax.precision import in_32_bits
 
 POSITION = (-1.2, 0.6)
 MAX_SPEED = 0.07
@@ -32,6 +33,7 @@ GRID = Grid(
 class MountainCar(Env):
     """A brax environment; its pipeline state is the observation."""
 
+    @in_32_bits
     def reset(self, rng: jax.Array) -> State:
         """At rest, somewhere in [-0.6, -0.4]."""
         position = jax.random.uniform(rng, minval=START[0], maxval=START[1])
@@ -39,13 +41,14 @@ class MountainCar(Env):
         start = jnp.stack([position, zero])
         return State(start, start, zero, zero)
 
+    @in_32_bits
     def step(self, state: State, action: jax.Array) -> State:
         """One step, single; an action of 1 is the whole engine.
 
         Raises:
           ValueError: an action of the wrong size.
         """
-        check_action(self, action)
+        action = check_action(self, action)
         position, velocity = state.pipeline_state
         force = jnp.clip(action[0], -1, 1)
         velocity = velocity + (force * POWER - GRAVITY * jnp.cos(3 * position))

@@ -15,6 +15,7 @@ from brax.envs.base import Env, State
 
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs.task import check_action
+from maxent_jax.precision import in_32_bits
 
 TIME_STEP = 0.05  # seconds
 GRAVITY, MASS, LENGTH = 10.0, 1.0, 1.0  # m/s², kg, m
@@ -45,19 +46,21 @@ GRID = Grid(
 class Pendulum(Env):
     """A brax environment; its pipeline state is [θ in [-π, π], angular velocity]."""
 
+    @in_32_bits
     def reset(self, rng: jax.Array) -> State:
         """Hanging at rest, whatever the key."""
         del rng
         hanging, zero = jnp.array([jnp.pi, 0.0]), jnp.zeros(())
         return State(hanging, observe(hanging), zero, zero)
 
+    @in_32_bits
     def step(self, state: State, action: jax.Array) -> State:
         """One step of 0.05 s, single; an action of 1 is the whole torque.
 
         Raises:
           ValueError: an action of the wrong size.
         """
-        check_action(self, action)
+        action = check_action(self, action)
         angle, speed = state.pipeline_state
         torque = MAX_TORQUE * jnp.clip(action[0], -1, 1)
         pull = 3 * GRAVITY / (2 * LENGTH) * jnp.sin(angle) + 3 / (MASS * LENGTH**2) * torque

@@ -52,6 +52,7 @@ class Options(NamedTuple):
 
 
 REFERENCE = Options()
+MUJOCO_LOG = "MUJOCO_LOG.TXT"  # where C MuJoCo writes, unless told of another place
 _INTEGRATORS = {
     "Euler": mujoco.mjtIntegrator.mjINT_EULER,
     "RK4": mujoco.mjtIntegrator.mjINT_RK4,
@@ -71,22 +72,37 @@ def gymnasium_xml(name: str) -> Path:
     return Path(spec.origin).parent / "envs" / "mujoco" / "assets" / name
 
 
+def keep_no_log() -> None:
+    """Keeps C MuJoCo from leaving its warnings in the working folder too; the console has them.
+
+    Of a diverging simulation it writes a line for each warning. A log file that the user chose by
+    MjLogConfig stays.
+    """
+    config = mujoco.MjLogConfig.get()
+    if config.logfile == MUJOCO_LOG and config.logto_file:
+        config.logto_file = False
+        mujoco.MjLogConfig.set(config)
+
+
 def load_model(xml: Path, options: Options = REFERENCE) -> mujoco.MjModel:
     """The MuJoCo model of a file, with its options changed.
 
     Raises:
       ConfigError: MuJoCo cannot read the file.
     """
+    keep_no_log()
     try:
         spec = mujoco.MjSpec.from_file(str(xml))
     except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"MuJoCo cannot read {xml}: {reason}") from None
+        raise ConfigError(_unreadable(xml, error)) from None
     if options.max_contacts is not None:
         for numeric in spec.numerics:  # MJX 3.17 finds its own only if no other stands before it
             spec.delete(numeric)
         spec.add_numeric(name="max_contact_points", size=1, data=[options.max_contacts])
-    model = spec.compile()
+    try:
+        model = spec.compile()
+    except ValueError as error:  # of a mesh that is missing, for example
+        raise ConfigError(_unreadable(xml, error)) from None
     if options.integrator is not None:
         model.opt.integrator = _INTEGRATORS[options.integrator]
     if options.solver is not None:
@@ -103,3 +119,7 @@ def load_model(xml: Path, options: Options = REFERENCE) -> mujoco.MjModel:
     # A diverging simulation must show as such: MuJoCo would put it back to its rest pose unsaid.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     return model
+
+
+def _unreadable(xml: Path, error: ValueError) -> str:
+    return f"MuJoCo cannot read {xml}: {' '.join(str(error).split())}"

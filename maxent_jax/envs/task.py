@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import mujoco
 from brax.envs.base import Env, State
 
-from maxent_jax.choices import BACKENDS, PHYSICS, ConfigError, check_choice
+from maxent_jax.choices import BACKENDS, PHYSICS, ConfigError, check_choice, check_number
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import mjx_backend, mujoco_backend, physics
 from maxent_jax.envs.physics import Derived, Options, PhysicsState
 from maxent_jax.envs.torso import Torso
+from maxent_jax.precision import in_32_bits
 
 
 class Task(NamedTuple):
@@ -46,9 +47,11 @@ class MujocoEnv(Env):
       end_flipped: also end an episode once the torso is upside down. Departs from Gymnasium.
       end_unhealthy: end an episode where health fails, as Gymnasium does.
     Raises:
-      ConfigError: an unknown backend or profile, or one that cannot run the task here.
+      ConfigError: an unknown backend or profile, or one that cannot run the task here; a torque
+        limit outside (0, 1].
     """
 
+    @in_32_bits
     def __init__(
         self,
         task: Task,
@@ -60,6 +63,8 @@ class MujocoEnv(Env):
     ):
         self.task = task
         self._backend = resolve_backend(backend)
+        if not 0 < check_number("torque_limit", torque_limit) <= 1:
+            raise ConfigError(f"torque_limit is {torque_limit}, but must be in (0, 1].")
         options = _options(task, profile)
         self.model = physics.load_model(task.xml, options)
         """The simulated model, MuJoCo's own."""
@@ -78,6 +83,7 @@ class MujocoEnv(Env):
         self._end_flipped = end_flipped
         self._end_unhealthy = end_unhealthy
 
+    @in_32_bits
     def reset(self, rng: jax.Array) -> State:
         """A fresh random start, single; vmap it over keys for more."""
         nv = self.model.nv
@@ -88,13 +94,14 @@ class MujocoEnv(Env):
         zero = jnp.zeros(())
         return State(start, self.task.observe(start, self._physics.derive(start)), zero, zero)
 
+    @in_32_bits
     def step(self, state: State, action: jax.Array) -> State:
         """One control step, single; an action in [-1, 1] spans the control range.
 
         Raises:
           ValueError: an action of the wrong size.
         """
-        check_action(self, action)
+        action = check_action(self, action)
         control = self._control_center + self._control_span * jnp.clip(action, -1, 1)
         after, derived = self._physics.step(state.pipeline_state, control)
         observation = self.task.observe(after, derived)
@@ -141,10 +148,12 @@ def observation_size(env: Env) -> int:
     return jax.eval_shape(env.reset, jax.random.key(0)).obs.shape[-1]
 
 
-def check_action(env: Env, action: jax.Array) -> None:
-    """Raises ValueError on an action whose last axis is not [A]."""
+def check_action(env: Env, action: jax.Array) -> jax.Array:
+    """The action in float32; raises ValueError where its last axis is not [A]."""
+    action = jnp.asarray(action, jnp.float32)
     if action.shape[-1:] != (env.action_size,):
         raise ValueError(f"action has shape {action.shape}, expected [{env.action_size}]")
+    return action
 
 
 def uniform_reset(noise: float) -> Callable[[jax.Array, PhysicsState], PhysicsState]:

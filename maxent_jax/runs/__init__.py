@@ -86,7 +86,7 @@ def read_config(directory: Path) -> Config:
     """
     path = directory / CONFIG
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
         schema, settings = content["schema"], content["config"]
     except (OSError, ValueError, KeyError, TypeError):
         raise RunError(
@@ -98,6 +98,15 @@ def read_config(directory: Path) -> Config:
         return Config(**settings)
     except (TypeError, ConfigError) as error:
         raise RunError(f"{path} does not fit this release: {error}") from None
+
+
+def is_config(path: Path) -> bool:
+    """Whether a run may have written that file: of any schema, or empty since the machine failed."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        return not text or {"schema", "config"} <= json.loads(text).keys()
+    except (OSError, ValueError, AttributeError):
+        return False
 
 
 def check_config(directory: Path, config: Config) -> None:
@@ -117,12 +126,12 @@ def check_config(directory: Path, config: Config) -> None:
 
 def read_versions(directory: Path) -> dict[str, str]:
     """Of the stack that began the run."""
-    return json.loads((directory / CONFIG).read_text())["versions"]
+    return json.loads((directory / CONFIG).read_text(encoding="utf-8"))["versions"]
 
 
 def read_id(directory: Path) -> str:
     """Of the run, drawn when it began."""
-    return json.loads((directory / CONFIG).read_text())["id"]
+    return json.loads((directory / CONFIG).read_text(encoding="utf-8"))["id"]
 
 
 def append_metrics(directory: Path, row: dict[str, Any]) -> None:
@@ -132,7 +141,7 @@ def append_metrics(directory: Path, row: dict[str, Any]) -> None:
       SaveError: it cannot be written; an unfinished line is left out by all who read.
     """
     path = directory / METRICS
-    with writing(path), open(path, "a") as file:
+    with writing(path), open(path, "a", encoding="utf-8") as file:
         file.write(_lines([row]))
         file.flush()
         os.fsync(file.fileno())
@@ -141,7 +150,7 @@ def append_metrics(directory: Path, row: dict[str, Any]) -> None:
 def read_metrics(directory: Path) -> list[dict[str, Any]]:
     """The rows of metrics.jsonl; an unfinished last line is left out."""
     path = directory / METRICS
-    lines = path.read_text().split("\n")[:-1] if path.exists() else []
+    lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
     try:
         return [json.loads(line) for line in lines]
     except ValueError:
@@ -151,7 +160,7 @@ def read_metrics(directory: Path) -> list[dict[str, Any]]:
 def write_metrics(directory: Path, rows: list[dict[str, Any]]) -> None:
     """metrics.jsonl with these rows and no others; where it has them, it is left as it is."""
     path, text = directory / METRICS, _lines(rows)
-    if not path.exists() or path.read_text() != text:
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
         _replace(path, text)
 
 
@@ -171,6 +180,16 @@ def jsonable(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def check_writable(directory: Path) -> None:
+    """Whether a command can leave its results there.
+
+    Raises:
+      RunError: it cannot.
+    """
+    if not os.access(directory, os.W_OK | os.X_OK):
+        raise RunError(f"{directory} cannot be written to: make it writable, or copy it elsewhere.")
 
 
 @contextlib.contextmanager
@@ -216,4 +235,4 @@ def _lines(rows: list[dict[str, Any]]) -> str:
 
 def _replace(path: Path, text: str) -> None:
     with whole_file(path) as temporary:
-        temporary.write_text(text)
+        temporary.write_text(text, encoding="utf-8")

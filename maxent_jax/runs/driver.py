@@ -13,7 +13,7 @@ from maxent_jax.runs import hosts
 from maxent_jax.visual import figures
 from maxent_jax.choices import UsageError
 from maxent_jax.runs.clock import Clock
-from maxent_jax.runs.display import Bar, duration, say
+from maxent_jax.runs.display import Bar, announce, duration, say
 from maxent_jax.runs.interruption import Interrupted, Interruption
 from maxent_jax.runs.sinks import Sinks
 from maxent_jax.runs.stages import Stage, advance, check_finite
@@ -22,6 +22,7 @@ from maxent_jax import (
     checkpoint,
     devices,
     integrity,
+    memory,
     methods,
     native,
     parts,
@@ -47,6 +48,16 @@ class Options(NamedTuple):
 AS_USUAL = Options()
 
 
+def check(config: Config, options: Options = AS_USUAL) -> None:
+    """Refuses what cannot run here, before anything is compiled or written.
+
+    Raises:
+      UsageError, ConfigError: no such device, no such share of devices, or too little memory.
+    """
+    runtime.check_devices()
+    memory.check(config, _chosen(options.num_devices))
+
+
 def train(
     config: Config, directory: Path, process_started: float, options: Options = AS_USUAL
 ) -> None:
@@ -56,13 +67,14 @@ def train(
       directory: exists; empty, or with this very run in it.
       process_started: time.perf_counter() when the program began, for the time to the first step.
     Raises:
-      UsageError, ConfigError: no such share of devices.
+      UsageError, ConfigError: see `check`.
       CheckpointCorruptError: the last checkpoint is damaged.
       SaveError: something cannot be written.
       NonFiniteError: training left the finite numbers.
       Interrupted: a signal came, and the run is saved.
     """
     runtime.prepare(config.simulates_in_jax)
+    check(config, options)
     placed = _placement(config, options.num_devices)
     hosts.first_alone(lambda: integrity.clear_unfinished(directory), "clear")
     progress = _last_progress(directory, options)
@@ -77,6 +89,8 @@ def train(
         stage = _fresh(config, directory, placed)
     else:
         stage = Stage(checkpoint.restore(directory, progress.name, config, placed), progress)
+    if hosts.is_first():
+        announce(config, directory, len(stage.progress.rows))
     programs = algorithm.programs(config) if placed is None else devices.programs(config, placed)
     rows = _train(config, directory, programs, stage, process_started, options)
     hosts.leave()
@@ -85,12 +99,17 @@ def train(
         _summarise(config, directory, rows)
 
 
-def _placement(config: Config, num_devices: int) -> State | None:
-    """Of the state on that many devices, 0 for all; None for one."""
+def _chosen(num_devices: int) -> list[jax.Device]:
+    """That many devices, 0 for all."""
     available = jax.devices()
     if num_devices > len(available):
         raise UsageError(f"devices is {num_devices}, but there are {len(available)}.")
-    chosen = available[: num_devices or None]
+    return available[: num_devices or None]
+
+
+def _placement(config: Config, num_devices: int) -> State | None:
+    """Of the state on that many devices, 0 for all; None for one."""
+    chosen = _chosen(num_devices)
     if len(chosen) == 1:
         return None
     return devices.placement(config, devices.make_mesh(config, chosen))

@@ -1,9 +1,11 @@
-"""SIGINT and SIGTERM: the first lets a run save where it next can, a second Ctrl-C ends it at once.
+"""SIGINT, SIGTERM and SIGHUP (a terminal that closes): the first lets a run save where it next can,
+a second Ctrl-C ends it at once.
 
 Python runs a signal's handler between two of its own instructions, and a compiled program may take
 minutes. So a thread reads what the signal leaves in a pipe, whatever the main thread is at.
 """
 
+import contextlib
 import os
 import signal
 import socket
@@ -11,7 +13,16 @@ import sys
 import threading
 from pathlib import Path
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
+
+
+def heeded() -> tuple[signal.Signals, ...]:
+    """Those that this process answers: under nohup SIGHUP stays ignored."""
+    return tuple(
+        number
+        for number in SIGNALS
+        if number in SIGNALS[:2] or signal.getsignal(number) != signal.SIG_IGN
+    )
 
 
 class Interrupted(Exception):
@@ -37,13 +48,13 @@ class Interruption:
         self._writing.setblocking(False)
         self._wakeup = signal.set_wakeup_fd(self._writing.fileno())
         # A handler in Python, though it does nothing, is what makes the signal reach the pipe.
-        self._handlers = [signal.signal(number, lambda *_: None) for number in SIGNALS]
+        self._handlers = {n: signal.signal(n, lambda *_: None) for n in heeded()}
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        for number, handler in zip(SIGNALS, self._handlers, strict=True):
+        for number, handler in self._handlers.items():
             signal.signal(number, handler)
         signal.set_wakeup_fd(self._wakeup)
         self._writing.close()  # which ends the thread
@@ -57,10 +68,11 @@ class Interruption:
                 continue
             if self.received is None:
                 self.received = number
-                print(
-                    "stopping at the next checkpoint; Ctrl-C once more to stop at once",
-                    file=sys.stderr,
-                    flush=True,
-                )
+                with contextlib.suppress(OSError, ValueError):  # the terminal may be gone
+                    print(
+                        "stopping at the next checkpoint; Ctrl-C once more to stop at once",
+                        file=sys.stderr,
+                        flush=True,
+                    )
             elif number == signal.SIGINT:
                 os._exit(128 + number)

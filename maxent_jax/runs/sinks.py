@@ -13,6 +13,7 @@ from maxent_jax.choices import UsageError
 from maxent_jax import runs
 from maxent_jax.config import Config
 
+FOLDERS = ("tensorboard", "wandb")  # in the run's directory
 Row = dict[str, Any]
 Scalars = dict[str, float]
 Sink = Callable[[Row], None]

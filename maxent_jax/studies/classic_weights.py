@@ -77,7 +77,7 @@ def _asked(scale: str, num_seeds: int | None) -> tuple[dict[str, Any], dict[str,
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return dict(json.loads(path.read_text()))
+        return dict(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
         raise UsageError(f"{path} cannot be read: choose another --out.") from None
 

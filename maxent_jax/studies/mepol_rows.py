@@ -30,7 +30,7 @@ def rows(directory: Path, config: Config, num_seeds: int) -> list[Row]:
         | {"settings": dataclasses.asdict(settings_of(config))}
     )
     with contextlib.suppress(OSError, ValueError, AttributeError):  # none yet, or a damaged one
-        held = json.loads(path.read_text())
+        held = json.loads(path.read_text(encoding="utf-8"))
         if {name: held.get(name) for name in asked} == asked:
             return [raw.known(row) for row in held["rows"]]
     found = _train(config, num_seeds)

@@ -199,7 +199,7 @@ def _claim(directory: Path, content: Changes) -> None:
     path = directory / STUDY
     if path.exists():
         try:
-            held = json.loads(path.read_text())
+            held = json.loads(path.read_text(encoding="utf-8"))
             differs = _difference(held, content)
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             differs = f"its {STUDY} cannot be read"
@@ -243,7 +243,7 @@ def home(directory: Path, cell: Cell) -> Path:
 
 def _cells(study: Path) -> dict[str, Changes]:
     try:
-        held = json.loads(study.read_text())
+        held = json.loads(study.read_text(encoding="utf-8"))
         return dict(held["cells"]) if held["version"] == VERSION else {}
     except (OSError, ValueError, KeyError, TypeError):
         return {}

@@ -52,7 +52,10 @@ def known(row: Row) -> Row:
 
 def write(path: Path, rows: Sequence[Row]) -> None:
     """As CSV, whole or not at all."""
-    with runs.whole_file(path) as temporary, open(temporary, "w", newline="") as file:
+    with (
+        runs.whole_file(path) as temporary,
+        open(temporary, "w", encoding="utf-8", newline="") as file,
+    ):
         writer = csv.DictWriter(file, COLUMNS, restval="")
         writer.writeheader()
         writer.writerows(rows)

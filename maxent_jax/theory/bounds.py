@@ -9,7 +9,9 @@ below uses; unnormalised ones, 1/(1 - γ) times as large, would multiply the ter
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from maxent_jax.choices import check_number, check_whole
 
 Errors = float | Sequence[float]
 
@@ -160,8 +162,7 @@ def veritas_epsilon(
       ValueError: T < 0, a negative quantity, not T + 1 errors, or an unknown form.
     Source: Theorem 1.
     """
-    if T < 0:
-        raise ValueError(f"T is {T}, but must be 0 or more")
+    _check_last(T)
     _check_constants(B, beta)
     if form not in FORMS:
         raise ValueError(f"unknown form '{form}': choose one of {', '.join(FORMS)}")
@@ -187,9 +188,8 @@ def hazan_epsilon(
       ValueError: T < 0, a negative quantity, or η outside (0, 1].
     Source: Hazan et al. 2019, Theorem 4.1's proof.
     """
-    if T < 0:
-        raise ValueError(f"T is {T}, but must be 0 or more")
-    if not 0 < eta <= 1:
+    _check_last(T)
+    if not 0 < check_number("eta", eta) <= 1:
         raise ValueError(f"eta is {eta}, but must be in (0, 1]")
     _check_constants(B, beta)
     errors = 2 * beta * _total("eps0", eps0, 1) + _total("eps1", eps1, 1)
@@ -217,6 +217,7 @@ def entropy_epsilon(T: int, num_states: int) -> tuple[float, float]:
     Raises:
       ValueError: T < 0 or |S| < 2.
     """
+    _check_last(T)
     _check_states(num_states)
     smoothing = math.sqrt(2 * (harmonic(T + 2) - 1) / (num_states * (T + 2)))
     of_smoothed = veritas_epsilon(T, objective_range(num_states, smoothing), smoothness(smoothing))
@@ -240,8 +241,7 @@ def harmonic(n: int) -> float:
     Raises:
       ValueError: n < 1.
     """
-    if n < 1:
-        raise ValueError(f"n is {n}, but must be at least 1")
+    check_whole("n", n, least=1)
     if n <= _SUMMED:
         return math.fsum(1 / i for i in range(1, n + 1))
     euler = 0.57721566490153286
@@ -260,26 +260,31 @@ def _first(holds: Callable[[int], bool]) -> int:
     return high
 
 
-def _total(name: str, errors: Errors, count: int) -> float:
-    if isinstance(errors, int | float):  # the same in each iteration
-        return count * _total(name, [errors], 1)
+def _total(name: str, errors: Any, count: int) -> float:
+    if not hasattr(errors, "__len__"):  # the same in each iteration
+        return count * _total(name, [check_number(name, errors)], 1)
     if len(errors) != count:
         raise ValueError(f"{name} has {len(errors)} entries, but there are {count} iterations")
-    if not all(0 <= error < math.inf for error in errors):
+    if not all(0 <= check_number(name, error) < math.inf for error in errors):
         raise ValueError(f"{name} must be 0 or more in every iteration")
     return math.fsum(errors)
 
 
 def _check_constants(B: float, beta: float) -> None:
-    if not (0 <= B < math.inf and 0 <= beta < math.inf):
+    if not all(0 <= check_number(*x) < math.inf for x in (("B", B), ("beta", beta))):
         raise ValueError(f"B is {B} and beta {beta}, but both must be 0 or more")
 
 
 def _check_positive(name: str, value: float) -> None:
-    if not 0 < value < math.inf:
+    if not 0 < check_number(name, value) < math.inf:
         raise ValueError(f"{name} is {value}, but must be a positive number")
 
 
 def _check_states(num_states: int) -> None:
-    if num_states < 2:
+    if not 2 <= check_number("num_states", num_states) < math.inf:
         raise ValueError(f"num_states is {num_states}, but must be at least 2")
+
+
+def _check_last(T: int) -> None:
+    if check_whole("T", T) < 0:
+        raise ValueError(f"T is {T}, but must be 0 or more")
