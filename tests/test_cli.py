@@ -155,6 +155,12 @@ def test_limits_with_which_jax_cannot_start_are_named(monkeypatch):
     monkeypatch.setattr(machine, "address_space", lambda: None)
     machine.check_limits()
 
+    monkeypatch.setattr(machine, "_limit", lambda name: {"RLIMIT_NOFILE": 24}[name])
+    with pytest.raises(UsageError, match=r"may open 24 files \(ulimit -n\)"):
+        machine.check_limits()
+    monkeypatch.undo()
+    monkeypatch.setattr(machine, "address_space", lambda: None)
+
     def no_thread(_):
         raise RuntimeError("can't start new thread")
 
