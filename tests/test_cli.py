@@ -277,7 +277,7 @@ def test_a_busy_directory_without_a_checkpoint_stays_busy(tmp_path):
         pass
 
 
-@pytest.mark.parametrize("what", ["file/run", "nowhere", "read_only"])
+@pytest.mark.parametrize("what", ["file/run", "nowhere", "read_only", "\udcff"])
 def test_a_place_that_cannot_be_written_is_known_at_once(tmp_path, monkeypatch, what):
     (tmp_path / "file").write_text("")
     (tmp_path / "nowhere").symlink_to("target")

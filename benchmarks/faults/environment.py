@@ -161,9 +161,9 @@ GROUPS: dict[str, tuple[Fault, ...]] = {
     "paths": (
         to("'{empty}/a b'", 0),
         to("{empty}/ümläut-λ", 0),
-        to("{empty}/100%#?&*", 0),
+        to("'{empty}/100%#?&*'", 0),
         to("$'{empty}/line\\nbreak'", 0),
-        to("$'{empty}/\\xff'", 0),
+        to("$'{empty}/\\xff'", 2, "must be UTF-8"),
         to("{empty}/x/../y", 0),
         to("{empty}/slash/", 0),
         Fault("train --preset smoke --env pendulum --out=-dash", 0, shell='cd {empty}; "$@"'),
