@@ -248,7 +248,8 @@ def _cause(fault: Fault, places: dict[str, Path], new: Path) -> tuple[str, float
     places["gone"].mkdir(exist_ok=True)
     filled = {name: str(path) for name, path in places.items()}
     given = fault.variables.format(**filled).split()
-    variables = " ".join(f"-u {word[1:]}" if word.startswith("-") else word for word in given)
+    taken = [f"-u {word[1:]}" for word in given if word.startswith("-")]
+    variables = " ".join([*taken, *(word for word in given if not word.startswith("-"))])
     words = fault.arguments.format(**filled)
     shell = fault.shell.format(**filled)
     script = f"set -- env {variables} {sys.executable} -m maxent_jax {words}; {shell}"
