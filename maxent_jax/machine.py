@@ -11,6 +11,7 @@ from maxent_jax.choices import UsageError
 CGROUPS = Path("/sys/fs/cgroup")
 # XLA ends a process that cannot have its threads or its memory, without a word that helps.
 LEAST_ADDRESS_SPACE = 3 * 2**30  # bytes; for preset smoke on two cores 2.1 GiB was too little
+LEAST_FILES = 128  # open at once; with 24 Orbax cannot save, and says so in a traceback
 THREADS_PER_CORE, MORE_THREADS = 4, 16
 
 
@@ -47,6 +48,12 @@ def check_limits() -> None:
             f"this process may have {readable(limit)} of address space (ulimit -v), but jax needs "
             f"{readable(LEAST_ADDRESS_SPACE)}: raise the limit."
         )
+    files = _limit("RLIMIT_NOFILE")
+    if files and files < LEAST_FILES:
+        raise UsageError(
+            f"this process may open {files} files (ulimit -n), but saving and loading runs needs "
+            f"{LEAST_FILES}: raise the limit."
+        )
     num_threads = THREADS_PER_CORE * (os.cpu_count() or 1) + MORE_THREADS
     if not _can_start(num_threads):
         raise UsageError(
@@ -57,11 +64,15 @@ def check_limits() -> None:
 
 def address_space() -> int | None:
     """`ulimit -v` in bytes; None where there is no limit."""
+    return _limit("RLIMIT_AS")
+
+
+def _limit(name: str) -> int | None:
     try:
         import resource
 
-        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    except (ImportError, OSError):
+        limit, _ = resource.getrlimit(getattr(resource, name))
+    except (ImportError, AttributeError, OSError):
         return None
     return None if limit == resource.RLIM_INFINITY else limit
 

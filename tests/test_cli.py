@@ -155,6 +155,12 @@ def test_limits_with_which_jax_cannot_start_are_named(monkeypatch):
     monkeypatch.setattr(machine, "address_space", lambda: None)
     machine.check_limits()
 
+    monkeypatch.setattr(machine, "_limit", lambda name: {"RLIMIT_NOFILE": 24}[name])
+    with pytest.raises(UsageError, match=r"may open 24 files \(ulimit -n\)"):
+        machine.check_limits()
+    monkeypatch.undo()
+    monkeypatch.setattr(machine, "address_space", lambda: None)
+
     def no_thread(_):
         raise RuntimeError("can't start new thread")
 
@@ -271,7 +277,7 @@ def test_a_busy_directory_without_a_checkpoint_stays_busy(tmp_path):
         pass
 
 
-@pytest.mark.parametrize("what", ["file/run", "nowhere", "read_only"])
+@pytest.mark.parametrize("what", ["file/run", "nowhere", "read_only", "\udcff"])
 def test_a_place_that_cannot_be_written_is_known_at_once(tmp_path, monkeypatch, what):
     (tmp_path / "file").write_text("")
     (tmp_path / "nowhere").symlink_to("target")

@@ -27,6 +27,7 @@ TRAIN = "train --preset smoke --env pendulum --out {new}"
 # A command that loads no array library, on a run that is there.
 VERIFY = "verify {run}"
 TOO_LARGE = "train --preset smoke --env pendulum --replay-size 2000000000"
+LEAVING = "cd {gone}; rmdir {gone}; "  # the working folder is gone
 READ_ONLY = "mount --bind {run} {run} && mount -o remount,ro,bind {run} && "
 
 
@@ -141,7 +142,7 @@ GROUPS: dict[str, tuple[Fault, ...]] = {
     "limits": (
         Fault(TRAIN, 2, "ulimit -v", shell='ulimit -v 1000000; "$@"'),
         Fault(TRAIN, 1, "File too large", shell='ulimit -f 1; "$@"'),
-        Fault(TRAIN, 1, "Too many open files", shell='ulimit -n 24; "$@"'),
+        Fault(TRAIN, 2, "may open 24 files", shell='ulimit -n 24; "$@"'),
         Fault(TRAIN, 0, shell='ulimit -s 1024; "$@"', same=True),
         Fault(TRAIN, 0, shell='ulimit -c 0; "$@"', same=True),
         Fault(f"{TOO_LARGE} --out {{new}}", 2, "of memory, but this machine has"),
@@ -160,16 +161,16 @@ GROUPS: dict[str, tuple[Fault, ...]] = {
     "paths": (
         to("'{empty}/a b'", 0),
         to("{empty}/ümläut-λ", 0),
-        to("{empty}/100%#?&*", 0),
+        to("'{empty}/100%#?&*'", 0),
         to("$'{empty}/line\\nbreak'", 0),
-        to("$'{empty}/\\xff'", 0),
+        to("$'{empty}/\\xff'", 2, "must be UTF-8"),
         to("{empty}/x/../y", 0),
         to("{empty}/slash/", 0),
         Fault("train --preset smoke --env pendulum --out=-dash", 0, shell='cd {empty}; "$@"'),
         Fault("verify -- -dash", 2, "not the directory of a run"),
         Fault("train --preset smoke --env pendulum --out '~'", 0, shell='cd {empty}; "$@"'),
-        Fault("train --preset smoke --env pendulum", 2, "cannot write", 'cd {gone}; rmdir .; "$@"'),
-        Fault(VERIFY, 0, shell='cd {gone}; rmdir {gone}; "$@"'),
+        Fault("train --preset smoke --env pendulum", 2, "cannot write", LEAVING + COMMAND),
+        Fault(VERIFY, 0, shell=LEAVING + COMMAND),
         to("{link}", 0),
         to("{begun}", 0),
         to("{dangling}", 2, "a link to nowhere"),
@@ -247,7 +248,8 @@ def _cause(fault: Fault, places: dict[str, Path], new: Path) -> tuple[str, float
     places["gone"].mkdir(exist_ok=True)
     filled = {name: str(path) for name, path in places.items()}
     given = fault.variables.format(**filled).split()
-    variables = " ".join(f"-u {word[1:]}" if word.startswith("-") else word for word in given)
+    taken = [f"-u {word[1:]}" for word in given if word.startswith("-")]
+    variables = " ".join([*taken, *(word for word in given if not word.startswith("-"))])
     words = fault.arguments.format(**filled)
     shell = fault.shell.format(**filled)
     script = f"set -- env {variables} {sys.executable} -m maxent_jax {words}; {shell}"

@@ -132,6 +132,10 @@ def check_free(arguments: Arguments) -> None:
 def _check_writable(directory: Path) -> None:
     """Raises UsageError where the directory cannot be made, or nothing be written into it."""
     place = next(p for p in (directory, *directory.absolute().parents) if os.path.lexists(p))
+    try:
+        str(directory.absolute()).encode()
+    except UnicodeEncodeError:  # bytes that are no text, which TensorStore cannot take
+        raise cli.UsageError(f"cannot write to {directory}: its path must be UTF-8.") from None
     if place.is_symlink() and not place.exists():
         raise cli.UsageError(f"cannot write to {directory}: {place} is a link to nowhere.")
     if not place.is_dir() and place != directory:
