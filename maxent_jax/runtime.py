@@ -104,9 +104,10 @@ def _check_flags() -> None:
     flags = os.environ.get("XLA_FLAGS", "").replace(IN_ORDER, "").strip()
     if not flags:
         return
+    others = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     done = subprocess.run(
         [sys.executable, "-c", PROBE],
-        env=os.environ | {"JAX_PLATFORMS": "cpu"},
+        env=others | {"JAX_PLATFORMS": "cpu"},
         capture_output=True,
         text=True,
         errors="replace",

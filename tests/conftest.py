@@ -11,18 +11,27 @@ import pytest
 
 from maxent_jax import runtime
 
-# Most of the time goes into compiling toy programs that run for milliseconds: LLVM may spare its
-# passes. Subprocesses inherit it. With another level in XLA_FLAGS, as in .ci/run, that one is used.
-UNOPTIMISED = "--xla_backend_optimization_level"
-if UNOPTIMISED not in os.environ.get("XLA_FLAGS", ""):
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {UNOPTIMISED}=1".strip()
 os.environ.setdefault("MPLBACKEND", "Agg")
 runtime.prepare(simulates_in_jax=True)
+# Small programs too: each file of tests compiles hundreds, and others have compiled most of them.
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_legacy_prng_key", "error")
 
 # Files that take longest come first, so that no worker is left with one at the end.
-LONGEST = ("test_train", "test_baselines", "test_algorithm", "test_devices", "test_physics")
+LONGEST = ("test_protocol", "test_train", "test_knn", "test_physics", "test_bonuses")
+# Toy programs run for milliseconds and compile for seconds: they are spared most optimisations.
+FAST = "JAX_DISABLE_MOST_OPTIMIZATIONS"
+
+
+def pytest_addoption(parser):
+    parser.addoption("--optimised", action="store_true", help="compile as a user's programs are")
+
+
+def pytest_configure(config):
+    fast = not config.getoption("--optimised")
+    jax.config.update(FAST.lower(), fast)
+    os.environ[FAST] = str(int(fast))  # of subprocesses
 
 
 def pytest_collection_modifyitems(items):

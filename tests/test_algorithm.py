@@ -96,6 +96,7 @@ def test_two_seeds_by_vmap_equal_two_single_runs():
             jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4), a, b)
 
 
+@pytest.mark.slow
 def test_seeds_differ():
     config = tiny(num_seeds=2)
     actors = algorithm.start(config).learner.agent.parameters.actor
@@ -133,6 +134,7 @@ def test_h_starts_from_scratch_la_goes_on_and_v_from_the_best():
         assert not leaves_equal(archived.actor, begun.learner.agent.parameters.actor)
 
 
+@pytest.mark.slow
 def test_fully_corrective_weights_are_measured_on_episodes_that_they_were_not_fitted_to(
     monkeypatch,
 ):
@@ -179,6 +181,7 @@ def test_a_frozen_reference_leaves_every_stored_distance_current(method):
         np.testing.assert_allclose(getattr(anew.items.distances, name), stored, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_la_learns_from_the_current_reference_whatever_the_replay_has_stored():
     config, _, _, _, state = stages("la")
     step = compiled_step(config.program())

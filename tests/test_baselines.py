@@ -79,6 +79,7 @@ def test_the_reward_of_h_as_published_falls_where_the_mixture_is():
     np.testing.assert_allclose(np.sort(payment), [1 / 1.125] + [8.0] * 64, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_ngu_remembers_each_episode_in_its_own_embedding():
     _, before, after, metrics = trained("ngu")
     assert before.memory.shape == (4, 100, 32)
@@ -130,6 +131,7 @@ COLUMNS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", COLUMNS)
 def test_a_bonus_is_shown_what_was_drawn_and_pays_before_it_learns(what):
     config = config_of("rnd", updates_per_step=0.5)

@@ -133,6 +133,7 @@ class TestEveryBonus:
         assert kinds(after) == kinds(state)
         assert kinds(novelty) == ((B,), jnp.float32, False)
 
+    @pytest.mark.slow
     def test_seeds_side_by_side_are_the_seeds_alone(self, name):
         _, init, step = made(name)
         keys = jax.random.split(KEY, 2)

@@ -79,6 +79,7 @@ def test_an_action_leads_on_as_in_gymnasium(rows):
         np.testing.assert_allclose(rows["next_observations"][i], after, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_policies_play_by_weight(run):
     weighted = dataclasses.replace(run, config=dataclasses.replace(run.config, method="h", eta=0.3))
     rows = weighted.dataset(20_000)
@@ -91,6 +92,7 @@ def test_policies_play_by_weight(run):
     assert (np.abs(played - expected) < bound).all() and bound < 40
 
 
+@pytest.mark.slow
 def test_a_larger_dataset_goes_on_where_a_smaller_one_was_cut(run, rows):
     fewer = run.dataset(2_500)
     for name, values in fewer.items():
@@ -131,6 +133,7 @@ class Breaking(Env):
         return state.replace(pipeline_state=after, obs=after)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("last", [3, 0])
 def test_what_is_not_finite_is_no_transition(last):
     envs.register(f"breaking-{last}", lambda backend, physics: Breaking(last))

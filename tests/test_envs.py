@@ -110,6 +110,7 @@ def lenient():
         yield
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["halfcheetah", "reacher"])
 def test_a_brax_environment_by_name(name, lenient):
     env = envs.make(f"brax:{name}")

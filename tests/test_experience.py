@@ -128,6 +128,7 @@ def test_all_that_still_have_their_start_are_drawn_alike(num_steps):
     assert (np.abs(counts - share) < 5 * np.sqrt(share)).all()
 
 
+@pytest.mark.slow
 def test_a_copy_is_the_transition_in_a_turned_world():
     """Both ends are turned alike, about the origin; heights and joints stay."""
     p = make(yaw_copies=3)
@@ -149,6 +150,7 @@ def test_a_copy_is_the_transition_in_a_turned_world():
     assert_measured(p, against, drawn)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("copies", [0, 2])
 @pytest.mark.parametrize("space", ["features", "position"])
 def test_measuring_all_anew_is_measuring_what_would_be_drawn(copies, space):
@@ -160,6 +162,7 @@ def test_measuring_all_anew_is_measuring_what_would_be_drawn(copies, space):
     assert_measured(p, other, drawn)
 
 
+@pytest.mark.slow
 def test_16_bits_round_the_states_and_nothing_else():
     wide, narrow = make(yaw_copies=0), make(yaw_copies=0, replay_dtype="float16")
     exact, rounded = (drawn_from(p, *filled(p, 31)[:2], 200) for p in (wide, narrow))
@@ -200,6 +203,7 @@ def test_a_million_transitions_of_humanoid_stay_within_their_memory(dtype, most)
     assert 0.9 * most < bytes_of(config) <= most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_steps", [6, 31], ids=["part full", "gone round"])
 @pytest.mark.parametrize("copies", [0, 2])
 def test_several_steps_are_those_that_followed_in_the_episode(num_steps, copies):

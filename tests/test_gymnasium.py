@@ -88,6 +88,7 @@ def test_a_step_is_gymnasiums_from_equal_states(name, env, reference, starts):
     np.testing.assert_array_equal(after.done > 0, ended)
 
 
+@pytest.mark.slow
 def test_trajectories_stay_with_gymnasiums(env, reference, starts):
     num, length = 50, 50
     first = jax.tree.map(lambda x: x[:num], starts)

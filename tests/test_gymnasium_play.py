@@ -92,6 +92,7 @@ def run():
     return make_pushing(episode_length=LENGTH, reference_size=64)
 
 
+@pytest.mark.slow
 def test_each_policy_plays_its_episodes(run):
     played = gymnasium_play.play(run, [0, 1, 1], seed=5)
     assert played.states.shape == (3, LENGTH, 29) and played.states.dtype == np.float32
@@ -110,6 +111,7 @@ def test_the_mixture_plays_by_weight(run):
     assert gymnasium_play.play(run, policies).policy.tolist() == [0, 0, 1, 1, 2, 2]
 
 
+@pytest.mark.slow
 def test_an_episode_ends_with_health_or_the_time_limit(run):
     played = gymnasium_play.rollout(run, episodes_per_policy=4, seed=6)
     assert played.policy.tolist() == [0] * 4 + [1] * 4 + [2] * 4
@@ -136,6 +138,7 @@ def test_chance_is_what_two_of_our_own_sets_differ_by():
     assert found == pytest.approx((3.7, 7.0, 3.3, np.sqrt(np.mean(squares))))
 
 
+@pytest.mark.slow
 def test_the_same_simulator_leaves_no_gap_and_another_does(run, monkeypatch):
     same = gymnasium_play.gap(run, episodes_per_policy=4)
     for name, gap in same.items():

@@ -208,6 +208,7 @@ def test_coinciding_particles_have_a_finite_entropy():
     np.testing.assert_allclose(entropy, np.log(20 * 1e-15) - special.digamma(K), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_log_probabilities_differ_as_those_of_scipys_normals():
     p = parts_of(FRAIL)
     state, _, batch = played(p, scale=0.3)
@@ -251,6 +252,7 @@ def test_an_environment_that_does_not_clip_its_actions_gets_them_clipped():
     np.testing.assert_array_equal(clipped, [-1.0, 0.5, 1.0])
 
 
+@pytest.mark.slow
 def test_states_beyond_an_episodes_end_change_nothing():
     p = parts_of(FRAIL)
     state, trajectories, batch = played(p)
@@ -291,6 +293,7 @@ def test_small_steps_go_on_to_the_last_and_raise_the_entropy():
     np.testing.assert_allclose(after.kl, kl, rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_trust_region_is_not_left():
     _, after, before, (_, kl) = ascended(**NARROW)
     assert after.num_accepted >= 2 and after.num_refused >= 1  # on the way, and in the end
@@ -345,6 +348,7 @@ def run(num_iterations=4):
     return stacked, {n: np.array([[m[n] for m in x] for x in metrics]).T for n in names}
 
 
+@pytest.mark.slow
 def test_it_learns_to_visit_more_than_the_untrained_policy():
     states, metrics = run()
     cells = np.asarray(states.visits.cells).reshape(5, 3, -1)
@@ -375,6 +379,7 @@ def test_iterate_is_compiled_once():
     assert mepol.iterate._cache_size() == 1
 
 
+@pytest.mark.slow
 def test_seeds_side_by_side_do_as_each_alone():
     states, metrics = run()
     side_by_side = jax.jit(jax.vmap(functools.partial(mepol.epoch, parts_of(STURDY), TINY)))

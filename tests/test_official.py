@@ -423,6 +423,7 @@ def test_coverage_in_training_never_falls(toy_trace):
     assert (trace.coverage[:, 0] == 0).all() and (trace.coverage[:, -1] > 2).all()
 
 
+@pytest.mark.slow
 def test_a_corner_that_is_rewarded_is_visited_more():
     settings = SETTINGS["mountain_car"]._replace(
         train_steps=100, hidden_size=32, learning_rate=0.01, num_runs=1

@@ -98,7 +98,7 @@ def relative_error(a, b):
 # (Ant).
 EULER = NEWTON._replace(integrator="Euler")  # which compiles in a third of the time
 BOUNDS = [
-    ("mjx", "ant", NEWTON, 1e-6, 1e-4),
+    pytest.param("mjx", "ant", NEWTON, 1e-6, 1e-4, marks=pytest.mark.slow),
     ("mjx", "walker2d", EULER, 1e-5, 1e-3),
     pytest.param("mjx", "humanoid", EULER, 1e-5, 1e-4, marks=pytest.mark.slow),
     pytest.param("mjx", "walker2d", NEWTON, 1e-5, 1e-3, marks=pytest.mark.slow),
@@ -111,6 +111,7 @@ BOUNDS = [
 DERIVED_BOUNDS = {"cinert": 1e-6, "cvel": 1e-5, "qfrc_actuator": 1e-7, "cfrc_ext": 1e-3}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("backend", "name", "options", "median", "high"), BOUNDS)
 def test_the_backends_agree(backend, name, options, median, high):
     task = envs.TASKS[name]
@@ -190,6 +191,7 @@ def test_contact_frames_of_a_capsule_are_those_of_c(degrees):
 LEADING = {"single": (), "one axis": (6,), "three axes": (2, 1, 3)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leading", LEADING.values(), ids=LEADING)
 @pytest.mark.parametrize("compiled", [False, True], ids=["eager", "jit"])
 def test_any_leading_axes_give_the_rows_of_one(step, path, model, visited, leading, compiled):

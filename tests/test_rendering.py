@@ -146,6 +146,7 @@ def untrained_run():
     return dataclasses.replace(run, mixture=run.mixture._replace(size=np.int32(1)))
 
 
+@pytest.mark.slow
 def test_the_episode_of_median_length_is_shown():
     (episode,) = film.median_episodes(untrained_run(), paths_of([5, 90, 7]))
     assert episode.name == "π0" and episode.weight == 1
@@ -177,6 +178,7 @@ def test_stills_run_from_the_first_step_to_the_last():
     assert film.stills(1, 3) == [0, 0, 0]
 
 
+@pytest.mark.slow
 def test_a_run_is_filmed(opengl, copy_of_smoke_run, capsys):
     directory = copy_of_smoke_run
     options = ("--size", SIZE, "--stills", 3, "--speed", 4, "--episodes", 1, "--seed", 3)
@@ -205,6 +207,7 @@ def size_of(path):
         return image.size
 
 
+@pytest.mark.slow
 def test_one_policy_is_filmed_alone(opengl, copy_of_smoke_run):
     directory = copy_of_smoke_run
     render.main([str(directory), "--policy", "2", "--size", "128", "--speed", "50"])

@@ -117,12 +117,14 @@ def test_the_strip_of_stills_is_shown_where_it_is_a_picture(page):
     assert len(strips) == 1
 
 
+@pytest.mark.slow
 def test_the_same_run_gives_the_same_page(directory, page, tmp_path):
     report.main([str(directory), "--episodes", "1", "--out", str(tmp_path / "again.html")])
     assert (tmp_path / "again.html").read_bytes() == (directory / "report.html").read_bytes()
     assert [path.name for path in tmp_path.iterdir()] == ["again.html"]
 
 
+@pytest.mark.slow
 def test_several_runs_share_one_page(directory, page, tmp_path, monkeypatch):
     shutil.copytree(directory, tmp_path / "_other")
     monkeypatch.chdir(tmp_path)
@@ -133,6 +135,7 @@ def test_several_runs_share_one_page(directory, page, tmp_path, monkeypatch):
     assert both.text.count("All settings") == 2
 
 
+@pytest.mark.slow
 def test_a_run_without_a_complete_iteration_has_a_page():
     run = untrained.make_run(num_iterations=1)
     section = report._seed_section(run, 0, report.Arguments((Path("nowhere"),), episodes=1))

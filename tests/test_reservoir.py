@@ -46,6 +46,7 @@ def test_the_count_is_the_states_seen_or_the_capacity(key, batch_sizes, seen):
     assert reservoir.count(kept) == min(seen, CAPACITY)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("batch_sizes", "valid_every"),
     [((40,), 1), ((7, 1, 12, 20), 1), ((1,) * 16, 1), ((30, 50, 40), 3)],

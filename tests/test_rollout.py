@@ -186,6 +186,7 @@ def test_an_episode_is_played_by_its_own_policy(key):
     np.testing.assert_allclose(found.states[: len(torque)], after.obs, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_policy_can_be_drawn_for_each_step(key):
     p = make_parts(mixing="step", leave_own_out=False)
     starts = make_starts(p)
@@ -223,6 +224,7 @@ def test_evaluation_plays_the_policies_that_count_by_their_means_if_asked(key):
     np.testing.assert_array_equal(found.states, again.states)  # no draw is left
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corrective", [False, True])
 def test_fully_corrective_weights_raise_the_entropy_of_the_same_states(key, corrective):
     p = make_parts(weights="fully_corrective" if corrective else "uniform")
@@ -286,6 +288,7 @@ def expected_scores(found, points, rows, config, size, capacity=4):
     return total / np.maximum(played, 1), total / np.maximum(lived, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leave_own_out", [False, True])
 @pytest.mark.parametrize("source", ["mixture", "history"])
 @pytest.mark.parametrize("num_policies", [1, 3])
@@ -321,6 +324,7 @@ def test_a_parked_policy_scores_low_only_among_its_own_states():
     assert best == {False: 0, True: 1}
 
 
+@pytest.mark.slow
 def test_a_policy_that_made_the_whole_reference_sees_its_own_states(key):
     # As the newest does, where it has all the weight; the others see it as ever.
     found = hand_made(key)

@@ -270,6 +270,7 @@ def test_temperature_falls_above_the_target_entropy_and_rises_below_it(log_std, 
     assert float(metrics["temperature"]) == pytest.approx(np.exp(step), rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layer_norm", [False, True])
 def test_updates_keep_every_type_and_so_compile_once(layer_norm, key):
     sac = make(critic_layer_norm=layer_norm)
@@ -319,6 +320,7 @@ def test_the_policy_spreads_no_less_and_no_more_than_its_range(asked, given):
     assert float(std) == pytest.approx(np.exp(given), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_networks_see_the_state_only_through_its_inputs(key):
     sac = agent.make(preset("smoke"), 3, 1, lambda state: jnp.square(state[..., :2]))
     learner = agent.init(sac, key)

@@ -94,6 +94,7 @@ def test_what_the_greedy_policy_visits_follows_from_the_chain_that_it_makes(dyna
     np.testing.assert_allclose(occupancy(mdp, policy), expected, rtol=0, atol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("horizon", [1, 2, 17])
 def test_finite_occupancy_of_two_states_in_closed_form(horizon):
     p, q = 0.3, 0.2
@@ -120,6 +121,7 @@ def simulated(dynamics, policy, goes_on, episodes, random):
     return visits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["discounted", "finite"])
 def test_occupancies_agree_with_a_million_simulated_steps(kind):
     dynamics, random = mdps.garnet(20, 4, 3, seed=0), np.random.default_rng(0)
@@ -135,6 +137,7 @@ def test_occupancies_agree_with_a_million_simulated_steps(kind):
     assert error.max() < 1e-3  # so that it can fail
 
 
+@pytest.mark.slow
 def test_sampled_episodes_visit_states_as_often_as_their_occupancy_says():
     mdp = mdps.discounted(SMALL, 0.8)
     policy = random_policy(mdp, 0)

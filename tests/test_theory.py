@@ -117,6 +117,7 @@ def test_once_planning_has_converged_its_start_does_not_matter(start):
     np.testing.assert_allclose(found.objective, run(V).objective, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_las_history_is_its_mixture_where_each_step_is_archived():
     trace = run(LA, iterations=20, steps=1)
     np.testing.assert_allclose(trace.history_objective, trace.objective, atol=1e-12)
@@ -126,6 +127,7 @@ def test_las_history_is_its_mixture_where_each_step_is_archived():
     assert apart.density_error[:, 1:].min() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_refresh_period_is_a_number_of_planning_steps():
     at_each, once, after_all = (
         run(LA._replace(refresh_period=period), steps=6).objective for period in (1, 0, 6)
@@ -134,6 +136,7 @@ def test_a_refresh_period_is_a_number_of_planning_steps():
     assert np.abs(at_each - once).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_policies_that_depend_on_time_come_near_the_optimum_too():
     mdp = mdps.finite_horizon(mdps.double_chain(7), 6)
     gap = optimum.solve(mdp, 1 / 7).objective - run(V, iterations=60, steps=6, mdp=mdp).objective
@@ -141,6 +144,7 @@ def test_policies_that_depend_on_time_come_near_the_optimum_too():
     assert (gap[:, -1] < 0.02 * gap[:, 0]).all()
 
 
+@pytest.mark.slow
 def test_seeds_and_mdps_side_by_side_change_nothing():
     some = [mdps.discounted(mdps.garnet(8, 3, 2, seed), DISCOUNT) for seed in (5, 2)]
     stacked, alone = run(V, mdp=MDP), []
@@ -212,6 +216,7 @@ def test_noise_has_the_size_that_was_asked_for():
     np.testing.assert_allclose(trace.planning_error, 0.05, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_where_one_policy_is_optimal_v_never_forgets_the_first():
     mdp = mdps.discounted(mdps.river_swim(20), 0.9)
     best = optimum.solve(mdp, 1 / 20)
@@ -229,6 +234,7 @@ def test_where_one_policy_is_optimal_v_never_forgets_the_first():
     assert (best.objective - forgetful < 1e-3 * gap).all()
 
 
+@pytest.mark.slow
 def test_fully_corrective_weights_find_the_optimum_that_the_solver_finds():
     first, _ = first_policies(MDP, 1)
     best = optimum.solve(MDP, SMOOTHING)
@@ -279,6 +285,7 @@ def test_ent_game_with_expected_visits_as_written_by_hand():
         np.testing.assert_allclose(found.entropy[seed], entropy, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_ent_game_with_sampled_visits_approaches_the_same_entropy():
     first, keys = first_policies(MDP, 2)
     sampled = peers.ent_game(MDP, first, 100, 1.0, True, keys).entropy

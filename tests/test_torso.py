@@ -120,6 +120,7 @@ def symmetry_error(env, states, actions, angle):
     return np.abs(turned_first - turned_last).max(1)
 
 
+@pytest.mark.slow
 def test_stepping_a_turned_state_turns_the_step(env, visited, actions):
     angle = jax.random.uniform(jax.random.key(6), (NUM_STATES,), minval=-np.pi, maxval=np.pi)
     # Measured 1e-6: rounding. A contact at its limit may make a hundred times as much of it.

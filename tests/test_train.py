@@ -128,6 +128,7 @@ def test_several_seeds_train_side_by_side(two_seeds):
         maxent_jax.load_run(two_seeds, seed_index=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["mujoco", pytest.param("mjx", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("method", "period"), [("h", -1), ("la", 1), ("la", 10), ("la", 0), ("v", -1)]
@@ -156,6 +157,7 @@ def run_smoke(directory, env, backend, **changes):
     assert (directory / "figures" / "fireworks.png").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("env", [pytest.param("humanoid", marks=pytest.mark.slow), "pendulum"])
 def test_every_environment_runs(tmp_path, env):
     run_smoke(tmp_path, env, "auto")
@@ -217,6 +219,7 @@ def test_evaluate_refuses_a_directory_that_is_no_run(tmp_path, damage):
     assert done.stderr.count("\n") == 1 and str(tmp_path) in done.stderr
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_is_named_and_passed_over_on_demand(finished, tmp_path):
     directory = tmp_path / "damaged"
     shutil.copytree(finished, directory)
@@ -315,6 +318,7 @@ def test_an_iteration_ends_at_a_plateau(tmp_path):
     assert maxent_jax.load_run(tmp_path).metrics["segment_reward"].shape == (1, 10)
 
 
+@pytest.mark.slow
 def test_the_feature_table_is_what_its_script_measures():
     from experiments import measure_features
     from maxent_jax import features
