@@ -168,7 +168,8 @@ def test_every_environment_runs(tmp_path, env):
     ("env", "backend"),
     [
         *(("mountain_car", "auto"), ("walker2d", "mujoco")),
-        *(("walker2d", "mjx"), ("humanoid", "mjx"), ("brax:halfcheetah", "auto")),
+        *(("walker2d", "mjx"), ("humanoid", "mjx")),
+        *(("brax:halfcheetah", "auto"), ("brax:ant", "mjx")),
     ],
 )
 def test_every_environment_runs_on_every_backend(tmp_path, env, backend):
