@@ -10,10 +10,13 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
+
+from maxent_jax import native
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "numpy")
 CORES = os.cpu_count() or 1
@@ -47,9 +50,20 @@ def print_versions(peers: Iterable[Peer] = ()) -> None:
     device = jax.devices()[0]
     print(
         f"# python {platform.python_version()} {versions} | {device.platform} "
-        f"{device.device_kind}, {CORES} CPU cores",
+        f"{device.device_kind}, {CORES} CPU cores ({_processor()}), native build "
+        f"{native.variant()}",
         flush=True,
     )
+
+
+def _processor() -> str:
+    """Its name, where Linux tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.machine()
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
 
 
 def importable(peers: Iterable[Peer]) -> list[tuple[Peer, ModuleType]]:
