@@ -306,7 +306,11 @@ def test_every_text_file_names_its_encoding():
 def test_a_run_whose_terminal_closes_is_saved(tmp_path):
     ours, theirs = os.openpty()
     run = tmp_path / "run"
-    words = [sys.executable, "-m", "maxent_jax", "train", *SMOKE, str(run)]
+    take_terminal = (
+        "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0);"
+        "os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
+    )
+    words = [sys.executable, "-c", take_terminal, "-m", "maxent_jax", "train", *SMOKE, str(run)]
     more = ["--num-iterations", "1000", "--mixture-episodes", "1001", "--save-iterations", "1000"]
     process = subprocess.Popen(
         [*words, *more],
@@ -314,7 +318,7 @@ def test_a_run_whose_terminal_closes_is_saved(tmp_path):
         stdout=theirs,
         stderr=theirs,
         cwd=ROOT,
-        preexec_fn=lambda: (os.setsid(), __import__("fcntl").ioctl(0, 0x540E, 0)),  # TIOCSCTTY
+        start_new_session=True,
     )
     os.close(theirs)
     while not runs.read_metrics(run):

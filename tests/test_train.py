@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from commands import ROOT, call
+from commands import ROOT, call, in_subprocess
 
 import maxent_jax
 from maxent_jax import envs, integrity, runs
@@ -169,11 +169,20 @@ def test_every_environment_runs(tmp_path, env):
     [
         *(("mountain_car", "auto"), ("walker2d", "mujoco")),
         *(("walker2d", "mjx"), ("humanoid", "mjx")),
-        *(("brax:halfcheetah", "auto"), ("brax:ant", "mjx")),
+        ("brax:halfcheetah", "auto"),
     ],
 )
 def test_every_environment_runs_on_every_backend(tmp_path, env, backend):
     run_smoke(tmp_path, env, backend)
+    jax.clear_caches()  # the largest programs, see conftest.forget_programs
+
+
+@pytest.mark.slow
+def test_an_environment_of_braxs_trains_on_mjx_and_saves_itself(tmp_path):
+    where = ("--env", "brax:ant", "--backend", "mjx", "--out", tmp_path / "run")
+    in_subprocess("train", "--preset", "smoke", "--num-iterations", "1", *where)
+    assert "checkpoint 1: intact" in call("verify", tmp_path / "run").stdout
+    assert (tmp_path / "run" / "figures" / "fireworks.png").exists()
 
 
 @pytest.mark.warp
