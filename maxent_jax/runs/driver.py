@@ -85,12 +85,12 @@ def train(
                 figures.draw(directory)
             print(f"{directory} is complete: nothing to train.")
         return
+    if hosts.is_first():
+        announce(config, directory, 0 if progress is None else len(progress.rows))
     if progress is None:
         stage = _fresh(config, directory, placed)
     else:
         stage = Stage(checkpoint.restore(directory, progress.name, config, placed), progress)
-    if hosts.is_first():
-        announce(config, directory, len(stage.progress.rows))
     programs = algorithm.programs(config) if placed is None else devices.programs(config, placed)
     rows = _train(config, directory, programs, stage, process_started, options)
     hosts.leave()
