@@ -101,7 +101,7 @@ def read_config(directory: Path) -> Config:
 
 
 def is_config(path: Path) -> bool:
-    """Whether a run may have written that file: of any schema, or empty since the machine failed."""
+    """Whether a run may have written that file: any schema, or empty because the machine failed."""
     try:
         text = path.read_text(encoding="utf-8")
         return not text or {"schema", "config"} <= json.loads(text).keys()

@@ -9,14 +9,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from maxent_jax.runs import hosts
-from maxent_jax.visual import figures
-from maxent_jax.choices import UsageError
-from maxent_jax.runs.clock import Clock
-from maxent_jax.runs.display import Bar, announce, duration, say
-from maxent_jax.runs.interruption import Interrupted, Interruption
-from maxent_jax.runs.sinks import Sinks
-from maxent_jax.runs.stages import Stage, advance, check_finite
 from maxent_jax import (
     algorithm,
     checkpoint,
@@ -32,7 +24,15 @@ from maxent_jax import (
 )
 from maxent_jax.algorithm import Programs, State
 from maxent_jax.checkpoint import Progress
+from maxent_jax.choices import UsageError
 from maxent_jax.config import Config
+from maxent_jax.runs import hosts
+from maxent_jax.runs.clock import Clock
+from maxent_jax.runs.display import Bar, announce, duration, say
+from maxent_jax.runs.interruption import Interrupted, Interruption
+from maxent_jax.runs.sinks import Sinks
+from maxent_jax.runs.stages import Stage, advance, check_finite
+from maxent_jax.visual import figures
 
 
 class Options(NamedTuple):
@@ -142,8 +142,8 @@ def _last_progress(directory: Path, options: Options) -> Progress | None:
         for what, now in (runs.stack() | _machine()).items():
             if computed_with.get(what) != now:
                 say(
-                    f"note: {what} was {computed_with.get(what)} and is {now}: from here on the run "
-                    f"may not be bit-identical to an undisturbed one."
+                    f"note: {what} was {computed_with.get(what)} and is {now}: from here on the "
+                    f"run may not be bit-identical to an undisturbed one."
                 )
         runs.write_metrics(directory, progress.rows)
 

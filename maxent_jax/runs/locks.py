@@ -6,8 +6,8 @@ from pathlib import Path
 
 import filelock
 
-from maxent_jax.choices import UsageError
 from maxent_jax import runs
+from maxent_jax.choices import UsageError
 
 LOCK = "lock"
 

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from maxent_jax.choices import UsageError
 from maxent_jax import runs
+from maxent_jax.choices import UsageError
 from maxent_jax.config import Config
 
 FOLDERS = ("tensorboard", "wandb")  # in the run's directory

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from maxent_jax.runs.clock import Clock
-from maxent_jax.runs.display import Bar
 from maxent_jax import algorithm, integrity, runs
 from maxent_jax.algorithm import Programs, State
 from maxent_jax.checkpoint import Progress
 from maxent_jax.config import Config
 from maxent_jax.convergence import has_plateaued
+from maxent_jax.runs.clock import Clock
+from maxent_jax.runs.display import Bar
 
 
 class Stage(NamedTuple):
