@@ -35,7 +35,7 @@ def step(config: Config, carry, key: jax.Array):
     p = parts.make(config)
     learner, episodes, ring = carry
     key_act, key_env, key_sample, key_update = jax.random.split(key, 4)
-    action = agent.act(p.sac, learner.parameters.actor, episodes.env.obs, key_act)
+    action = agent.act(p.sac, learner.parameters.policy, episodes.env.obs, key_act)
     episodes, t = base.step(p.env, episodes, action, config.episode_length, key_env)
     velocity = (t.next_observation[:, 0] - t.observation[:, 0]) / p.env.dt
     alive = 1.0 - t.terminated.astype(jnp.float32)

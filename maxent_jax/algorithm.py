@@ -151,7 +151,7 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
     """Archives the agent, and measures what has been reached."""
     p = parts.make(config)
     learner = state.learner
-    archive = mixture.append(state.archive, learner.agent.parameters)
+    archive = mixture.append(state.archive, agent.archived(learner.agent))
     weights = state.method.weights[archive.size - 1]
     key_starts, key_rollout, key_rows = jax.random.split(jax.random.key(EVALUATION_SEED), 3)
 

@@ -32,6 +32,7 @@ from maxent_jax.occupancy import Occupancy, Scores
 from maxent_jax.parts import Parts
 from maxent_jax.precision import in_32_bits
 from maxent_jax.sac import agent
+from maxent_jax.sac.agent import Policy
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -111,7 +112,7 @@ class Run:
           IndexError: no such policy.
         The function raises ValueError where a state is not [..., D].
         """
-        return functools.partial(_act, self.parts, self._actor(index))
+        return functools.partial(_act, self.parts, self._policy(index))
 
     @in_32_bits
     def act(self, s: jax.Array, key: jax.Array, policy: int | None = None) -> jax.Array:
@@ -130,7 +131,7 @@ class Run:
         Raises:
           IndexError: no such policy.
         """
-        return export.policy(self.parts.sac, self._actor(index), deterministic)
+        return export.policy(self.parts.sac, self._policy(index), deterministic)
 
     @in_32_bits
     def occupancy(self, episodes_per_policy: int = 5, seed: int = 0) -> Occupancy:
@@ -217,22 +218,22 @@ class Run:
         """With which policies play equally often, and the states of each share its weight."""
         return parts.make(dataclasses.replace(self.config, pooled=False, mixing="episode"))
 
-    def _actor(self, index: int) -> Any:
+    def _policy(self, index: int) -> Policy:
         check_whole("policy", index)
         if not -self.num_policies <= index < self.num_policies:
             raise IndexError(
                 f"policy is {index}, but the mixture has {self.num_policies}: choose from 0 to "
                 f"{self.num_policies - 1}"
             )
-        return mixture.policy(self.mixture, jnp.asarray(index % self.num_policies)).actor
+        return mixture.policy(self.mixture, jnp.asarray(index % self.num_policies)).policy
 
 
 @in_32_bits
-def _act(parts: Parts, actor: Any, states: jax.Array, key: jax.Array) -> jax.Array:
+def _act(parts: Parts, policy: Policy, states: jax.Array, key: jax.Array) -> jax.Array:
     size = parts.sac.observation_size
     if jnp.shape(states)[-1:] != (size,):
         raise ValueError(f"states have shape {jnp.shape(states)}, but must be [..., {size}]")
-    return agent.act(parts.sac, actor, jnp.asarray(states, jnp.float32), key)
+    return agent.act(parts.sac, policy, jnp.asarray(states, jnp.float32), key)
 
 
 _of_mixture = jax.jit(occupancy.of_mixture, static_argnums=0)

@@ -73,6 +73,8 @@ class Config:
     alone: free of the noise of the joints)."""
     shaping_survives_death: bool = False
     """A state in which health fails keeps its potential: not policy-invariant."""
+    alive_bonus: float = 0.0
+    """Paid for each step that does not end in death, on the scale of what SAC is paid."""
     stale_rewards: bool = False
     """Keep what a step was paid when it was taken, whatever becomes of the reference."""
     episodic_weight: float = 0.0
@@ -137,6 +139,14 @@ class Config:
     """α at the start."""
     target_entropy_scale: float = 1.0
     """Target entropy is minus this many nats per action dimension."""
+    lagrangian_entropy: bool = False
+    """Count the policy's entropy from its target in the soft return, so that at its target a policy
+    neither gains nor loses by living."""
+    normalize_inputs: bool = False
+    """Networks see their inputs less the running mean of training, over its deviation."""
+    actor_average: float = 0.0
+    """Rate at which an average follows the actor, update by update; the average is archived. 0: the
+    actor itself is."""
     restart_temperature: bool = False
     """Put α back to its initial value at the start of each iteration."""
 
@@ -256,6 +266,7 @@ _POSITIVE = (
 _AT_MOST_ONE = ("torque_limit", "discount", "soft_update_rate", "eta")
 _NOT_NEGATIVE = (
     *("seed", "plateau_segments", "plateau_tolerance", "shaping", "episodic_weight"),
+    *("alive_bonus", "actor_average"),
     *("yaw_copies", "discount", "target_entropy_scale"),
 )
 

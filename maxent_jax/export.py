@@ -1,18 +1,16 @@
 """A policy as a program of its own, which runs where this package is not installed."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from jax import export
 
 from maxent_jax.sac import agent
-from maxent_jax.sac.agent import Sac
+from maxent_jax.sac.agent import Policy, Sac
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 
 
-def policy(sac: Sac, actor: Any, deterministic: bool = False) -> export.Exported:
+def policy(sac: Sac, policy: Policy, deterministic: bool = False) -> export.Exported:
     """A policy with its weights, for any number of states, on any of PLATFORMS.
 
     Its `call` takes (states [b, D] float32, a typed key), or states alone if it is deterministic,
@@ -20,17 +18,17 @@ def policy(sac: Sac, actor: Any, deterministic: bool = False) -> export.Exported
     them where there are flatbuffers and this jax or, as jax promises for six months, a newer one.
 
     Args:
-      actor: its weights.
+      policy: its weights, and the moments of its inputs.
       deterministic: the action at the mean of the Gaussian before the tanh, not one that is drawn.
     """
     states = jax.ShapeDtypeStruct((*export.symbolic_shape("b"), sac.observation_size), jnp.float32)
     key = jax.ShapeDtypeStruct((), jax.random.key(0).dtype)
 
     def draw(states, key):
-        return agent.act(sac, actor, states, key)
+        return agent.act(sac, policy, states, key)
 
     def mean(states):
-        return agent.act(sac, actor, states, jax.random.key(0), deterministic=True)
+        return agent.act(sac, policy, states, jax.random.key(0), deterministic=True)
 
     if deterministic:
         return export.export(jax.jit(mean), platforms=PLATFORMS)(states)

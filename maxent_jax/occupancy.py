@@ -149,12 +149,12 @@ def play(
 
     Every episode holds its own copy of the actor's weights: E times their size in memory.
     """
-    actors = mixture.policy(archive, episode_policy).actor
+    policies = mixture.policy(archive, episode_policy).policy
 
     def act(observation, key_step):
         keys = jax.random.split(key_step, episode_policy.shape[0])
-        one = lambda actor, s, k: agent.act(parts.sac, actor, s, k, deterministic)
-        return jax.vmap(one)(actors, observation, keys)
+        one = lambda policy, s, k: agent.act(parts.sac, policy, s, k, deterministic)
+        return jax.vmap(one)(policies, observation, keys)
 
     return _play(parts, act, starts, key)
 
@@ -168,8 +168,8 @@ def _act_by_any(parts: Parts, archive: Archive, weights: jax.Array, deterministi
     def act(observation, key_step):
         key_draw, key_act = jax.random.split(key_step)
         keys = jax.random.split(key_act, weights.shape[0])
-        one = lambda actor, k: agent.act(parts.sac, actor, observation, k, deterministic)
-        actions = jax.vmap(one)(archive.parameters.actor, keys)  # [P, E, A]
+        one = lambda policy, k: agent.act(parts.sac, policy, observation, k, deterministic)
+        actions = jax.vmap(one)(archive.parameters.policy, keys)  # [P, E, A]
         drawn = jax.random.categorical(key_draw, jnp.log(weights), shape=observation.shape[:1])
         return jnp.take_along_axis(actions, drawn[None, :, None], axis=0)[0]
 

@@ -119,6 +119,7 @@ PAPER: dict[str, tuple[Any, str]] = {
     "yaw_copies": (0, "episodes turned by a random yaw are learned from too"),
     "reward": ("paper", "the reward's form is not p log R"),
     "reward_scale": (1.0, "the reward is scaled"),
+    "alive_bonus": (0.0, "a step alive is paid for"),
     "stale_rewards": (False, "rewards are not those of the current reference"),
     "shaping": (0.0, "the reward is shaped by a potential"),
     "shaping_survives_death": (False, "the potential survives death: not policy-invariant"),
@@ -141,5 +142,8 @@ PAPER: dict[str, tuple[Any, str]] = {
     "soft_update_rate": (0.005, "the soft update is not 0.005"),
     "initial_temperature": (0.2, "the temperature starts elsewhere than at 0.2"),
     "target_entropy_scale": (1.0, "the target entropy is not minus the number of actions"),
+    "lagrangian_entropy": (False, "the soft return counts entropy from its target"),
+    "normalize_inputs": (False, "networks see inputs of mean 0 and deviation 1"),
+    "actor_average": (0.0, "an average of the actor over its updates is archived"),
     "restart_temperature": (False, "the temperature restarts in each iteration"),
 }

@@ -83,9 +83,9 @@ def step(parts: Parts, method: Method, learner: Learner, key: jax.Array) -> tupl
     config = parts.config
     key_act, key_random, key_env, key_history, key_yaw, key_learn = jax.random.split(key, 6)
 
-    actor = learner.agent.parameters.actor
+    policy = learner.agent.parameters.policy
     observation = learner.episodes.env.obs[: config.num_envs]
-    action = sac_agent.act(parts.sac, actor, observation, key_act)
+    action = sac_agent.act(parts.sac, policy, observation, key_act)
     if config.random_baseline:
         random = jax.random.uniform(key_random, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.concatenate([action, random])
@@ -105,6 +105,7 @@ def step(parts: Parts, method: Method, learner: Learner, key: jax.Array) -> tupl
     )
     ended = transition.terminated | transition.truncated
     learner = learner._replace(
+        agent=sac_agent.see(parts.sac, learner.agent, observation, transition.valid),
         replay=ring,
         place=jnp.where(ended, -1 - episodes.start[: config.num_envs], rows),
         episodes=episodes,
@@ -154,7 +155,7 @@ def reward(parts: Parts, outcomes: Outcomes) -> jax.Array:
             alive=1.0 - outcomes.terminated,
             survives_death=config.shaping_survives_death,
         )
-    return config.reward_scale * paid
+    return config.reward_scale * paid + config.alive_bonus * (1.0 - outcomes.terminated)
 
 
 def returns(outcomes: Outcomes, paid: jax.Array, discount: float) -> tuple[jax.Array, jax.Array]:

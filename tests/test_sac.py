@@ -10,6 +10,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 import scipy.integrate
 import scipy.stats
@@ -56,7 +57,7 @@ def draw(low, high, seed=0):
     return np.random.default_rng(seed).uniform(low, high, (NUM_UPDATES, BATCH_SIZE))
 
 
-def learn(key, state, action, reward, next_state, discount, temperature=NO_ENTROPY_BONUS):
+def learn(key, state, action, reward, next_state, discount, temperature=NO_ENTROPY_BONUS, sac=SAC):
     """What a learner knows after NUM_UPDATES updates, each on fresh transitions; and its metrics.
 
     Columns are scalars or [NUM_UPDATES, BATCH_SIZE]; the temperature is the one at the start.
@@ -69,16 +70,16 @@ def learn(key, state, action, reward, next_state, discount, temperature=NO_ENTRO
     batches = losses.Batch(
         state[..., None], action[..., None], reward, next_state[..., None], discount
     )
-    parameters, metrics = _learn(batches, jnp.log(jnp.float32(temperature)), key)
+    parameters, metrics = _learn(sac, batches, jnp.log(jnp.float32(temperature)), key)
     return parameters, {name: np.asarray(values) for name, values in metrics.items()}
 
 
-@jax.jit
-def _learn(batches, log_temperature, key):
+@functools.partial(jax.jit, static_argnums=0)
+def _learn(sac, batches, log_temperature, key):
     key_init, key_updates = jax.random.split(key)
-    fresh = agent.init(SAC, key_init)
+    fresh = agent.init(sac, key_init)
     learner, metrics = jax.lax.scan(
-        lambda learner, inputs: agent.update(SAC, learner, *inputs),
+        lambda learner, inputs: agent.update(sac, learner, *inputs),
         fresh._replace(parameters=fresh.parameters._replace(log_temperature=log_temperature)),
         (batches, jax.random.split(key_updates, NUM_UPDATES)),
     )
@@ -185,6 +186,34 @@ def test_policy_values_and_temperature_settle_where_soft_optimality_puts_them(st
     assert settled["temperature"] == pytest.approx(c, rel=0.05)
     # Left out of the bootstrap, the entropy would shift the values by γ / (1 - γ) c × it = 0.16.
     assert np.abs(error).mean() < 0.08
+
+
+@pytest.mark.parametrize("lagrangian", [False, True])
+def test_a_policy_at_its_target_entropy_lives_where_living_pays(lagrangian, key):
+    # Two states, alive and dead: an action above 0 lives on, another dies. Each side has one best
+    # action, and another loses 10 times the square of its distance. At the temperature held here,
+    # 0.16, a Gaussian at the target entropy of -1 is soft-optimal: its deviation is 0.09, its loss
+    # 0.08, which is paid back. Living then brings 0.12 a step, 1.2 in all, and dying 0. SAC's own
+    # soft return counts 0.12 - 0.16 for a step alive, so it does better to lie between the two and
+    # die at every second step. Counted from its target, entropy costs nothing, and it lives.
+    sac = make(
+        discount=0.9,
+        learning_rate=LEARNING_RATE,
+        soft_update_rate=0.05,
+        lagrangian_entropy=lagrangian,
+    )
+    held = {"learned": sac.optimizer, "held": optax.set_to_zero()}
+    sac = sac._replace(optimizer=optax.multi_transform(held, ("learned", "learned", "held")))
+    action = draw(-1, 1)
+    lives = action > 0
+    reward = np.where(lives, 0.12, 0) + 0.08 - 10 * (action - np.where(lives, 0.25, -0.25)) ** 2
+    parameters, _ = learn(
+        key, 0, action, reward, next_state=0, discount=lives, temperature=0.16, sac=sac
+    )
+    lived = scipy.stats.norm.sf(0, *policy(parameters, 0.0))
+    value = float(agent.value(sac, parameters, jnp.zeros((1000, 1)), key).mean())
+    # Measured over seeds 0 .. 4: 0.45 to 0.48 and -0.18 to -0.16; 0.995 to 0.998 and 0.6 to 1.15.
+    assert lived > 0.95 and value > 0.4 if lagrangian else lived < 0.6 and value < 0
 
 
 # One update, of networks that ignore their input.
@@ -306,8 +335,8 @@ def test_restarting_keeps_what_is_known_and_forgets_the_optimisers(key):
 
 
 def test_acting_draws_from_the_tanh_of_the_gaussian_for_any_leading_axes(key):
-    actor = constant(mean=0.4, log_std=-0.5).parameters.actor
-    action = agent.act(HAND, actor, jnp.zeros((50, 80, 1)), key)
+    policy = constant(mean=0.4, log_std=-0.5).parameters.policy
+    action = agent.act(HAND, policy, jnp.zeros((50, 80, 1)), key)
     assert action.shape == (50, 80, 1)
     raw = np.arctanh(np.asarray(action, np.float64).ravel())
     cdf = scipy.stats.norm(0.4, np.exp(-0.5)).cdf

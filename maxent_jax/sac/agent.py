@@ -7,9 +7,17 @@ import jax.numpy as jnp
 import optax
 
 from maxent_jax.config import Config
-from maxent_jax.sac import losses
+from maxent_jax.sac import losses, normalizer
 from maxent_jax.sac.networks import Actor, Critic, Inputs
+from maxent_jax.sac.normalizer import Normalizer
 from maxent_jax.types import Metrics
+
+
+class Policy(NamedTuple):
+    """What acting takes."""
+
+    actor: Any
+    normalizer: Normalizer | None  # of the inputs; None: they pass unchanged
 
 
 class Parameters(NamedTuple):
@@ -19,6 +27,12 @@ class Parameters(NamedTuple):
     critic: Any
     target_critic: Any
     log_temperature: jax.Array  # []
+    normalizer: Normalizer | None = None
+
+    @property
+    def policy(self) -> Policy:
+        """The actor, with the moments of the inputs that it was trained on."""
+        return Policy(self.actor, self.normalizer)
 
 
 class Agent(NamedTuple):
@@ -26,6 +40,7 @@ class Agent(NamedTuple):
 
     parameters: Parameters
     optimizer: Any
+    average: Any = None  # of the actor over its updates, where that is what is archived
 
 
 class Sac(NamedTuple):
@@ -41,6 +56,9 @@ class Sac(NamedTuple):
     discount: float
     soft_update_rate: float
     optimizer: optax.GradientTransformation
+    normalizes: bool = False
+    lagrangian: bool = False
+    average_rate: float = 0.0
 
 
 def make(config: Config, observation_size: int, action_size: int, inputs: Inputs) -> Sac:
@@ -56,6 +74,9 @@ def make(config: Config, observation_size: int, action_size: int, inputs: Inputs
         discount=config.discount,
         soft_update_rate=config.soft_update_rate,
         optimizer=optax.adam(config.learning_rate),
+        normalizes=config.normalize_inputs,
+        lagrangian=config.lagrangian_entropy,
+        average_rate=config.actor_average,
     )
 
 
@@ -71,20 +92,38 @@ def init(sac: Sac, key: jax.Array) -> Agent:
             critic=critic,
             target_critic=jax.tree.map(jnp.copy, critic),  # two buffers, so both can be donated
             log_temperature=jnp.log(jnp.asarray(sac.initial_temperature, jnp.float32)),
+            normalizer=normalizer.init(inputs.shape[-1]) if sac.normalizes else None,
         ),
     )
 
 
 def restart(sac: Sac, parameters: Parameters) -> Agent:
     """A learner that knows what `parameters` know, with fresh optimisers."""
-    return Agent(parameters, sac.optimizer.init(_learned(parameters)))
+    average = jax.tree.map(jnp.copy, parameters.actor) if sac.average_rate else None
+    return Agent(parameters, sac.optimizer.init(_learned(parameters)), average)
+
+
+def see(sac: Sac, agent: Agent, observation: jax.Array, counts: jax.Array) -> Agent:
+    """With the moments of its inputs after those states [N, D] that count, [N] bool."""
+    parameters = agent.parameters
+    if parameters.normalizer is None:
+        return agent
+    moved = normalizer.add(parameters.normalizer, sac.inputs(observation), counts)
+    return agent._replace(parameters=parameters._replace(normalizer=moved))
+
+
+def archived(agent: Agent) -> Parameters:
+    """What the mixture keeps of it."""
+    if agent.average is None:
+        return agent.parameters
+    return agent.parameters._replace(actor=agent.average)
 
 
 def act(
-    sac: Sac, actor: Any, observation: jax.Array, key: jax.Array, deterministic: bool = False
+    sac: Sac, policy: Policy, observation: jax.Array, key: jax.Array, deterministic: bool = False
 ) -> jax.Array:
     """An action drawn from the policy, or its mean: [..., D] -> [..., A] in [-1, 1]."""
-    mean, log_std = _policy(sac, actor, sac.inputs(observation))
+    mean, log_std = _policy(sac, policy.actor, _inputs(sac, policy.normalizer, observation))
     if deterministic:
         return jnp.tanh(mean)
     return jnp.tanh(mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape))
@@ -92,17 +131,18 @@ def act(
 
 def value(sac: Sac, parameters: Parameters, observation: jax.Array, key: jax.Array) -> jax.Array:
     """The critics' estimate of a state's soft value by one action drawn, [..., D] -> [...]."""
-    inputs = sac.inputs(observation)
+    inputs = _inputs(sac, parameters.normalizer, observation)
     action, log_prob = losses.sample_action(*_policy(sac, parameters.actor, inputs), key)
     values = _values(sac, parameters.target_critic, inputs, action)
-    return jnp.min(values, axis=-1) - jnp.exp(parameters.log_temperature) * log_prob
+    surprise = log_prob + (sac.target_entropy if sac.lagrangian else 0.0)
+    return jnp.min(values, axis=-1) - jnp.exp(parameters.log_temperature) * surprise
 
 
 def update(sac: Sac, agent: Agent, batch: losses.Batch, key: jax.Array) -> tuple[Agent, Metrics]:
     """One gradient step of critics, actor and temperature, and of the target critics after them."""
     key_next, key_actor = jax.random.split(key)
     parameters = agent.parameters
-    inputs = sac.inputs(batch.observation)
+    inputs = _inputs(sac, parameters.normalizer, batch.observation)
     target = _target(sac, parameters, batch, key_next)
 
     def critic_loss(critic):
@@ -134,7 +174,21 @@ def update(sac: Sac, agent: Agent, batch: losses.Batch, key: jax.Array) -> tuple
         "temperature": jnp.exp(log_temperature),
         "value": jnp.mean(target),
     }
-    return Agent(Parameters(actor, critic, target_critic, log_temperature), optimizer), metrics
+    average = agent.average
+    if average is not None:
+        average = optax.incremental_update(actor, average, sac.average_rate)
+    learned = parameters._replace(
+        actor=actor,
+        critic=critic,
+        target_critic=target_critic,
+        log_temperature=log_temperature,
+    )
+    return Agent(learned, optimizer, average), metrics
+
+
+def _inputs(sac: Sac, moments: Normalizer | None, observation: jax.Array) -> jax.Array:
+    inputs = sac.inputs(observation)
+    return inputs if moments is None else normalizer.apply(moments, inputs)
 
 
 def _policy(sac: Sac, actor: Any, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
