@@ -10,6 +10,7 @@ import pytest
 
 from maxent_jax import algorithm, experience, mixture, occupancy, parts, training
 from maxent_jax.config import preset
+from maxent_jax.sac import agent
 
 TINY = dict(num_segments=1, mixture_episodes=4, num_iterations=3, shaping=1.0, backend="mujoco")
 
@@ -132,6 +133,29 @@ def test_h_starts_from_scratch_la_goes_on_and_v_from_the_best():
     for i in range(2):
         archived = mixture.policy(before.archive, jnp.asarray(i))
         assert not leaves_equal(archived.actor, begun.learner.agent.parameters.actor)
+
+
+def test_an_archived_policy_keeps_the_moments_that_it_was_trained_with():
+    config = tiny(normalize_inputs=True, actor_average=0.1)
+    p, state = parts.make(config), algorithm.start(config)
+    states = jax.random.normal(jax.random.key(1), (5, 29))
+
+    def acts(state):
+        known = mixture.policy(state.archive, jnp.asarray(1)).policy
+        return agent.act(p.sac, known, states, jax.random.key(2))
+
+    for _ in range(2):
+        for part in ("begin", "train_segment"):
+            state, _ = call(part, config, state)
+        before, (state, _) = state, call("end", config, state)
+        learner = state.learner.agent
+        archived = mixture.policy(state.archive, state.archive.size - 1)
+        assert leaves_equal(archived.normalizer, learner.parameters.normalizer)
+        assert leaves_equal(archived.actor, learner.average)
+        assert float(archived.normalizer.count) == float(state.learner.env_steps)
+        assert state.iteration == 1 or leaves_equal(acts(before), acts(state))
+    first, second = (mixture.policy(state.archive, jnp.asarray(i)).normalizer for i in (1, 2))
+    assert not leaves_equal(first, second)
 
 
 @pytest.mark.slow

@@ -47,9 +47,17 @@ class StopAt(Interruption):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "period"), [("h", -1), ("la", 10), ("v", -1)])
-def test_a_run_stopped_anywhere_ends_as_one_that_was_not(tmp_path, monkeypatch, method, period):
-    config = preset("smoke", env="pendulum", method=method, refresh_period=period, num_seeds=2)
+@pytest.mark.parametrize(
+    "changes",
+    [
+        dict(method="h"),
+        dict(method="la", refresh_period=10),
+        dict(normalize_inputs=True, actor_average=0.01, learning_rate_end=0.1),
+    ],
+    ids=["h", "la", "v"],
+)
+def test_a_run_stopped_anywhere_ends_as_one_that_was_not(tmp_path, monkeypatch, changes):
+    config = preset("smoke", env="pendulum", num_seeds=2, **changes)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     for directory in (whole, broken):
         directory.mkdir()

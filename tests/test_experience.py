@@ -10,7 +10,7 @@ import pytest
 from maxent_jax import experience, parts, training
 from maxent_jax.config import preset
 from maxent_jax.experience import Reference
-from maxent_jax.types import Outcomes, Transition
+from maxent_jax.types import Distances, Outcomes, Transition
 
 NUM_ENVS, CAPACITY, SIZE = 3, 24, 29
 STARTS = 5
@@ -257,3 +257,11 @@ def test_returns_by_hand():
     total, beyond = training.returns(outcomes, paid, 0.5)
     np.testing.assert_allclose(total, [3, 2, 2])
     np.testing.assert_allclose(beyond, [1 / 4, 1 / 2, 0])  # one γ more in the Bellman target
+
+
+def test_a_step_alive_is_paid_for_and_a_death_is_not():
+    distances = Distances(*(jnp.ones((2, 1)) for _ in range(3)))
+    terminated = jnp.array([[False], [True]])
+    outcomes = Outcomes(None, None, jnp.zeros((2, 1)), terminated, distances, ~terminated)
+    without, paid = (training.reward(make(alive_bonus=b), outcomes) for b in (0.0, 0.3))
+    np.testing.assert_allclose(paid - without, [[0.3], [0]], atol=1e-5)

@@ -334,6 +334,36 @@ def test_restarting_keeps_what_is_known_and_forgets_the_optimisers(key):
     assert not any(np.any(x) for x in jax.tree.leaves(again.optimizer))
 
 
+def test_the_average_follows_the_actor_and_is_what_is_archived(key):
+    sac = HAND._replace(average_rate=0.25)
+    before = agent.init(sac, key)
+    after, _ = agent.update(sac, before, HALF_TERMINAL, key)
+    kept = agent.archived(after)
+    jax.tree.map(
+        lambda found, old, new: np.testing.assert_allclose(
+            found, 0.75 * old + 0.25 * new, atol=1e-6
+        ),
+        kept.actor,
+        *(jax.tree.map(np.asarray, each.parameters.actor) for each in (before, after)),
+    )
+    assert kept.critic is after.parameters.critic
+    again = agent.restart(sac, kept)
+    jax.tree.map(np.testing.assert_array_equal, again.average, kept.actor)
+    assert agent.archived(agent.init(HAND, key)).actor is not None
+
+
+def test_the_learning_rate_falls_in_a_line_within_an_iteration_and_starts_anew(key):
+    # 400 env steps and a quarter of an update for each: 100 gradient steps an iteration.
+    sac = make(learning_rate=0.01, learning_rate_end=0.1)
+    gradient, optimizer = jnp.ones(1), sac.optimizer.init(jnp.ones(1))
+    moved = []
+    for _ in range(120):
+        step, optimizer = sac.optimizer.update(gradient, optimizer)
+        moved.append(-float(step[0]))
+    expected = 0.01 * (1 - 0.9 * (np.arange(120) % 100) / 100)  # Adam's step is its rate
+    np.testing.assert_allclose(moved, expected, rtol=1e-3)
+
+
 def test_acting_draws_from_the_tanh_of_the_gaussian_for_any_leading_axes(key):
     policy = constant(mean=0.4, log_std=-0.5).parameters.policy
     action = agent.act(HAND, policy, jnp.zeros((50, 80, 1)), key)

@@ -73,11 +73,20 @@ def make(config: Config, observation_size: int, action_size: int, inputs: Inputs
         initial_temperature=config.initial_temperature,
         discount=config.discount,
         soft_update_rate=config.soft_update_rate,
-        optimizer=optax.adam(config.learning_rate),
+        optimizer=optax.adam(_rate(config)),
         normalizes=config.normalize_inputs,
         lagrangian=config.lagrangian_entropy,
         average_rate=config.actor_average,
     )
+
+
+def _rate(config: Config) -> float | optax.Schedule:
+    """Of learning, by the gradient steps since the optimiser was fresh."""
+    if config.learning_rate_end == 1:
+        return config.learning_rate
+    steps = config.num_segments * config.vector_steps * config.updates_per_vector_step
+    lost = 1 - config.learning_rate_end
+    return lambda count: config.learning_rate * (1 - lost * (count % steps) / steps)
 
 
 def init(sac: Sac, key: jax.Array) -> Agent:
