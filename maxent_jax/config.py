@@ -123,7 +123,7 @@ class Config:
     learning_rate: float = 3e-4
     """Adam, for actor, critics and temperature."""
     learning_rate_end: float = 1.0
-    """Share of the learning rate that is left at an iteration's end, to which it falls in a line."""
+    """Share of it that is left at the end of an iteration, within which it falls in a line."""
     batch_size: int = 128
     """Transitions in a gradient step."""
     replay_size: int = 1_000_000
@@ -149,6 +149,8 @@ class Config:
     actor_average: float = 0.0
     """Rate at which an average follows the actor, update by update; the average is archived. 0: the
     actor itself is."""
+    restart_actor: bool = False
+    """Start each iteration with an untrained actor, whatever agent it starts from."""
     restart_temperature: bool = False
     """Put α back to its initial value at the start of each iteration."""
 

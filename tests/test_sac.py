@@ -339,13 +339,10 @@ def test_the_average_follows_the_actor_and_is_what_is_archived(key):
     before = agent.init(sac, key)
     after, _ = agent.update(sac, before, HALF_TERMINAL, key)
     kept = agent.archived(after)
-    jax.tree.map(
-        lambda found, old, new: np.testing.assert_allclose(
-            found, 0.75 * old + 0.25 * new, atol=1e-6
-        ),
-        kept.actor,
-        *(jax.tree.map(np.asarray, each.parameters.actor) for each in (before, after)),
-    )
+    both = (jax.tree.leaves(each.parameters.actor) for each in (before, after))
+    for found, old, new in zip(jax.tree.leaves(kept.actor), *both, strict=True):
+        expected = 0.75 * np.asarray(old) + 0.25 * np.asarray(new)
+        np.testing.assert_allclose(found, expected, atol=1e-6)
     assert kept.critic is after.parameters.critic
     again = agent.restart(sac, kept)
     jax.tree.map(np.testing.assert_array_equal, again.average, kept.actor)
