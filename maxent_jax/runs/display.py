@@ -81,7 +81,8 @@ class Bar:
             disable=not self._in_terminal,
         )
         self._config, self._iteration, self._segments = config, iteration, segments
-        self._reached, self._rate = _reached(last_row), []
+        self._reached = _reached(last_row)
+        self._rate: list[str] = []
         self._trained_here = 0  # segments, by this process
         self._task = self._progress.add_task(
             self._description(),
