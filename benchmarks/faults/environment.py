@@ -1,10 +1,11 @@
 """Do variables, streams, limits and paths that a user may have end in a traceback, or in damage?
 
 Each fault is a command of ours in a shell: it must end with the code that is expected, at most one
-sentence on standard error, and never a traceback.
+sentence on standard error beside its progress, and never a traceback.
 """
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -29,6 +30,12 @@ VERIFY = "verify {run}"
 TOO_LARGE = "train --preset smoke --env pendulum --replay-size 2000000000"
 LEAVING = "cd {gone}; rmdir {gone}; "  # the working folder is gone
 READ_ONLY = "mount --bind {run} {run} && mount -o remount,ro,bind {run} && "
+
+# What a run says when all is well; a path in it may hold a line's end.
+PROGRESS = re.compile(
+    r"^(\w+ on \w+, preset .*? Ctrl-C saves the run|compiled[^\n]*|iteration \d[^\n]*)\n",
+    re.MULTILINE | re.DOTALL,
+)
 
 
 class Fault(NamedTuple):
@@ -263,7 +270,7 @@ def _cause(fault: Fault, places: dict[str, Path], new: Path) -> tuple[str, float
         check=False,
     )
     seconds = round(time.perf_counter() - started, 2)
-    said = done.stderr.decode(errors="replace")
+    said = PROGRESS.sub("", done.stderr.decode(errors="replace"))
     closed = "2>&-" in fault.shell or "2> /dev/full" in fault.shell
     met = done.returncode == fault.code
     sentence = "note: " if fault.code == 0 else "error: "

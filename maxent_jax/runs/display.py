@@ -9,7 +9,16 @@ from typing import Any, TypeVar
 import numpy as np
 from rich import progress
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Column
+from rich.text import Text
 
 from maxent_jax.config import Config
 
@@ -63,22 +72,23 @@ class Bar:
         self._in_terminal = console.is_terminal
         self._progress = Progress(
             TextColumn("{task.description}"),
-            BarColumn(bar_width=16),
-            TextColumn("{task.fields[status]}"),
-            TimeElapsedColumn(),
+            BarColumn(bar_width=16, table_column=Column(no_wrap=True)),
+            TimeElapsedColumn(table_column=Column(no_wrap=True)),
             TextColumn("left"),
-            TimeRemainingColumn(),
+            TimeRemainingColumn(table_column=Column(no_wrap=True)),
+            _Status("{task.fields[status]}", table_column=Column()),
             console=console,
             disable=not self._in_terminal,
         )
         self._config, self._iteration, self._segments = config, iteration, segments
-        self._reached, self._rate = _reached(last_row), ""
+        self._reached = _reached(last_row)
+        self._rate: list[str] = []
         self._trained_here = 0  # segments, by this process
         self._task = self._progress.add_task(
             self._description(),
             total=config.num_iterations * config.num_segments,
             completed=iteration * config.num_segments + segments,
-            status=f"compiling{self._reached}",
+            status=_together("compiling", *self._reached),
         )
 
     def __enter__(self) -> "Bar":
@@ -93,7 +103,7 @@ class Bar:
         """After a segment."""
         c, now = self._config, time.perf_counter()
         steps = c.num_seeds * c.vector_steps * c.num_envs
-        self._rate = f" · {steps / (now - self._last):,.0f} steps/s"
+        self._rate = [f"{steps / (now - self._last):,.0f} steps/s"]
         self._segments, self._trained_here = self._segments + 1, self._trained_here + 1
         self._last = now
         if self._trained_here == 1:
@@ -107,10 +117,9 @@ class Bar:
         self._iteration, self._segments = self._iteration + 1, 0
         self._reached, self._last = _reached(row), time.perf_counter()
         self._show()
-        self._line(
-            f"iteration {self._iteration}/{self._config.num_iterations} · {self._spent()}"
-            f"{self._reached} · {duration(row['wall_seconds'])}{self._left()}"
-        )
+        name = f"iteration {self._iteration}/{self._config.num_iterations}"
+        spent = f"{duration(row['wall_seconds'])}{self._left()}"
+        self._line(_together(name, *self._spent(), *self._reached, spent))
 
     def _left(self) -> str:
         """An estimate, from all segments of this process but the first, which is compiled."""
@@ -132,25 +141,38 @@ class Bar:
     def _done_segments(self) -> int:
         return self._iteration * self._config.num_segments + self._segments
 
-    def _spent(self) -> str:
+    def _spent(self) -> list[str]:
         c, vector_steps = self._config, self._done_segments() * self._config.vector_steps
-        return (
-            f"{vector_steps * c.num_envs:,} env steps · "
-            f"{vector_steps * c.updates_per_vector_step:,} updates"
-        )
+        return [
+            f"{vector_steps * c.num_envs:,} env steps",
+            f"{vector_steps * c.updates_per_vector_step:,} updates",
+        ]
 
     def _show(self) -> None:
         self._progress.update(
             self._task,
             completed=self._done_segments(),
             description=self._description(),
-            status=f"{self._spent()}{self._rate}{self._reached}",
+            status=_together(*self._reached, *self._spent(), *self._rate),
         )
 
 
-def _reached(row: dict[str, Any]) -> str:
+class _Status(TextColumn):
+    """The one column that a narrow terminal cuts."""
+
+    def render(self, task: Task) -> Text:
+        text = super().render(task)
+        text.no_wrap, text.overflow = True, "ellipsis"
+        return text
+
+
+def _together(*parts: str) -> str:
+    return " · ".join(parts)
+
+
+def _reached(row: dict[str, Any]) -> list[str]:
     """Coverage and entropy, of all seeds on average."""
     if not row:
-        return ""
+        return []
     coverage = np.mean(row["cumulative_coverage"])
-    return f" · {coverage:,.0f} cells · {np.mean(row['cumulative_entropy']):.2f} nats"
+    return [f"{coverage:,.0f} cells", f"{np.mean(row['cumulative_entropy']):.2f} nats"]
