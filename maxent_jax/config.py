@@ -122,8 +122,6 @@ class Config:
     """Layer norm in the critics; departs from the paper."""
     learning_rate: float = 3e-4
     """Adam, for actor, critics and temperature."""
-    learning_rate_end: float = 1.0
-    """Share of it that is left at the end of an iteration, within which it falls in a line."""
     batch_size: int = 128
     """Transitions in a gradient step."""
     replay_size: int = 1_000_000
@@ -267,10 +265,10 @@ _POSITIVE = (
     *("updates_per_step", "torque_limit", "reward_distance", "reward_scale", "learning_rate"),
     *("soft_update_rate", "initial_temperature", "eta"),
 )
-_AT_MOST_ONE = ("torque_limit", "discount", "soft_update_rate", "eta", "learning_rate_end")
+_AT_MOST_ONE = ("torque_limit", "discount", "soft_update_rate", "eta", "actor_average")
 _NOT_NEGATIVE = (
     *("seed", "plateau_segments", "plateau_tolerance", "shaping", "episodic_weight"),
-    *("alive_bonus", "actor_average", "learning_rate_end"),
+    *("alive_bonus", "actor_average"),
     *("yaw_copies", "discount", "target_entropy_scale"),
 )
 

@@ -134,7 +134,6 @@ PAPER: dict[str, tuple[Any, str]] = {
     "hidden_size": (256, "hidden layers are not 256 wide"),
     "critic_layer_norm": (False, "critics have layer norm"),
     "learning_rate": (3e-4, "Adam's rate is not 3e-4"),
-    "learning_rate_end": (1.0, "Adam's rate falls within an iteration"),
     "batch_size": (128, "the batch is not 128"),
     "replay_size": (1_000_000, "the replay does not hold 1e6 transitions"),
     "replay_dtype": ("float32", "states in the replay are rounded to 16 bits"),

@@ -52,7 +52,7 @@ class StopAt(Interruption):
     [
         dict(method="h"),
         dict(method="la", refresh_period=10),
-        dict(normalize_inputs=True, actor_average=0.01, learning_rate_end=0.1),
+        dict(normalize_inputs=True, actor_average=0.01),
     ],
     ids=["h", "la", "v"],
 )

@@ -22,7 +22,7 @@ def test_moments_are_those_of_all_inputs_that_count():
     ]
     all_seen = np.concatenate([inputs[counts] for inputs, counts in batches])
     known = seen(batches)
-    assert float(known.count) == len(all_seen)
+    assert float(known.number) == len(all_seen)
     np.testing.assert_allclose(known.mean, all_seen.mean(0), rtol=1e-5)
     np.testing.assert_allclose(known.variance, all_seen.var(0), rtol=1e-4)
     scaled = normalizer.apply(known, jnp.asarray(all_seen, jnp.float32))

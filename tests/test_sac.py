@@ -346,19 +346,8 @@ def test_the_average_follows_the_actor_and_is_what_is_archived(key):
     assert kept.critic is after.parameters.critic
     again = agent.restart(sac, kept)
     jax.tree.map(np.testing.assert_array_equal, again.average, kept.actor)
-    assert agent.archived(agent.init(HAND, key)).actor is not None
-
-
-def test_the_learning_rate_falls_in_a_line_within_an_iteration_and_starts_anew(key):
-    # 400 env steps and a quarter of an update for each: 100 gradient steps an iteration.
-    sac = make(learning_rate=0.01, learning_rate_end=0.1)
-    gradient, optimizer = jnp.ones(1), sac.optimizer.init(jnp.ones(1))
-    moved = []
-    for _ in range(120):
-        step, optimizer = sac.optimizer.update(gradient, optimizer)
-        moved.append(-float(step[0]))
-    expected = 0.01 * (1 - 0.9 * (np.arange(120) % 100) / 100)  # Adam's step is its rate
-    np.testing.assert_allclose(moved, expected, rtol=1e-3)
+    plain = agent.init(HAND, key)
+    assert agent.archived(plain) is plain.parameters
 
 
 def test_acting_draws_from_the_tanh_of_the_gaussian_for_any_leading_axes(key):

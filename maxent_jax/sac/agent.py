@@ -40,7 +40,7 @@ class Agent(NamedTuple):
 
     parameters: Parameters
     optimizer: Any
-    average: Any = None  # of the actor over its updates, where that is what is archived
+    average: Any  # of the actor over its updates; None where that is not what is archived
 
 
 class Sac(NamedTuple):
@@ -56,9 +56,9 @@ class Sac(NamedTuple):
     discount: float
     soft_update_rate: float
     optimizer: optax.GradientTransformation
-    normalizes: bool = False
-    lagrangian: bool = False
-    average_rate: float = 0.0
+    normalizes: bool
+    lagrangian: bool
+    average_rate: float
 
 
 def make(config: Config, observation_size: int, action_size: int, inputs: Inputs) -> Sac:
@@ -73,20 +73,11 @@ def make(config: Config, observation_size: int, action_size: int, inputs: Inputs
         initial_temperature=config.initial_temperature,
         discount=config.discount,
         soft_update_rate=config.soft_update_rate,
-        optimizer=optax.adam(_rate(config)),
+        optimizer=optax.adam(config.learning_rate),
         normalizes=config.normalize_inputs,
         lagrangian=config.lagrangian_entropy,
         average_rate=config.actor_average,
     )
-
-
-def _rate(config: Config) -> float | optax.Schedule:
-    """Of learning, by the gradient steps since the optimiser was fresh."""
-    if config.learning_rate_end == 1:
-        return config.learning_rate
-    steps = config.num_segments * config.vector_steps * config.updates_per_vector_step
-    lost = 1 - config.learning_rate_end
-    return lambda count: config.learning_rate * (1 - lost * (count % steps) / steps)
 
 
 def init(sac: Sac, key: jax.Array) -> Agent:

@@ -12,7 +12,7 @@ SMALLEST_VARIANCE = 1e-4
 class Normalizer(NamedTuple):
     """Moments of all inputs seen so far; none yet: inputs pass unchanged."""
 
-    count: jax.Array  # [] float32: beyond 2^24 steps it no longer grows, and the mean still moves
+    number: jax.Array  # [] float32, of inputs
     mean: jax.Array  # [I]
     variance: jax.Array  # [I]
 
@@ -31,11 +31,11 @@ def add(normalizer: Normalizer, inputs: jax.Array, counts: jax.Array) -> Normali
     new = jnp.sum(counts, dtype=jnp.float32)
     mean = jnp.sum(inputs, axis=0, where=chosen) / jnp.maximum(new, 1.0)
     squares = jnp.sum((inputs - mean[None]) ** 2, axis=0, where=chosen)
-    count, total = normalizer.count, normalizer.count + new
+    known, total = normalizer.number, normalizer.number + new
     gap, share = mean - normalizer.mean, new / jnp.maximum(total, 1.0)
-    pooled = (normalizer.variance * count + squares) / jnp.maximum(total, 1.0)
+    pooled = (normalizer.variance * known + squares) / jnp.maximum(total, 1.0)
     moved = Normalizer(
-        count=total,
+        number=total,
         mean=normalizer.mean + share * gap,
         variance=pooled + (1 - share) * share * gap**2,
     )
