@@ -142,7 +142,7 @@ def unshaped_reward(parts: Parts, distance: jax.Array) -> jax.Array:
 
 
 def reward(parts: Parts, outcomes: Outcomes) -> jax.Array:
-    """What SAC is paid for each step, [...]: r_t, its shaping, and the episodic term."""
+    """What SAC is paid for each step, [...]: r_t, its shaping, the episodic term, and for living."""
     config = parts.config
     distances = outcomes.distances
     paid = unshaped_reward(parts, distances.reached) + config.episodic_weight * outcomes.bonus
@@ -155,7 +155,11 @@ def reward(parts: Parts, outcomes: Outcomes) -> jax.Array:
             alive=1.0 - outcomes.terminated,
             survives_death=config.shaping_survives_death,
         )
-    return config.reward_scale * paid + config.alive_bonus * (1.0 - outcomes.terminated)
+    return config.reward_scale * paid + _for_living(parts, outcomes)
+
+
+def _for_living(parts: Parts, outcomes: Outcomes) -> jax.Array:
+    return parts.config.alive_bonus * (1.0 - outcomes.terminated)
 
 
 def returns(outcomes: Outcomes, paid: jax.Array, discount: float) -> tuple[jax.Array, jax.Array]:
@@ -287,7 +291,8 @@ def _paid_by_bonus(
 
     keys = jax.random.split(key_learn, steps.value.shape[0])
     bonus, metrics = jax.lax.scan(learn, bonus, (steps, keys))
-    return bonus, paid.reshape(*steps.value.shape, 1), metrics | {"bonus_size": size}
+    paid = paid.reshape(*steps.value.shape, 1) + _for_living(parts, outcomes)
+    return bonus, paid, metrics | {"bonus_size": size}
 
 
 def _cells(parts: Parts, states: jax.Array) -> jax.Array:
