@@ -142,7 +142,7 @@ def unshaped_reward(parts: Parts, distance: jax.Array) -> jax.Array:
 
 
 def reward(parts: Parts, outcomes: Outcomes) -> jax.Array:
-    """What SAC is paid for each step, [...]: r_t, its shaping, the episodic term, and for living."""
+    """What SAC is paid for each step, [...]: r_t, shaping, the episodic term, and for living."""
     config = parts.config
     distances = outcomes.distances
     paid = unshaped_reward(parts, distances.reached) + config.episodic_weight * outcomes.bonus
