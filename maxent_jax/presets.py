@@ -67,6 +67,15 @@ _LOCOMOTION = dict(
     reward_distance=20.0,
     reward_scale=8.0,
 )
+# Of a robot that dies from running badly: dying brings nothing, and living costs nothing. It starts
+# from scratch, for from the best it only ever goes that one's way (docs/learning.md).
+_UPRIGHT = _LOCOMOTION | dict(
+    shaping_survives_death=False,
+    lagrangian_entropy=True,
+    normalize_inputs=True,
+    actor_average=1e-3,
+    start="scratch",
+)
 _CLASSIC = dict(episode_length=200)
 _ROBOTS: dict[str, dict[str, Any]] = {
     "ant": dict(
@@ -76,13 +85,17 @@ _ROBOTS: dict[str, dict[str, Any]] = {
         yaw_copies=1,
         **_LOCOMOTION,
     ),
-    "walker2d": _LOCOMOTION,
+    "walker2d": _UPRIGHT,
     "humanoid": dict(policy_inputs="heading", **_LOCOMOTION),
+}
+# A first policy that walks takes 100,000 gradient steps.
+_BUDGETS = {
+    "walker2d": dict(num_iterations=3, steps_per_iteration=480_000, replay_size=480_000),
 }
 
 # What a preset does otherwise in some environment.
 IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
-    **{("quick", env): changes for env, changes in _ROBOTS.items()},
+    **{("quick", env): changes | _BUDGETS.get(env, {}) for env, changes in _ROBOTS.items()},
     **{("gpu", env): dict(physics="fast", **changes) for env, changes in _ROBOTS.items()},
     **{
         ("gpu", env): dict(reference_size=32_768, reward_distance=0.1, **_CLASSIC)
@@ -104,9 +117,13 @@ IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
 PLAIN: dict[str, Any] = dict(shaping=0.0, shaping_survives_death=False, return_steps=1)
 # Bonuses are divided by their deviation; the distance to the reference has its own scale instead.
 _AS_PUBLISHED: dict[str, Any] = PLAIN | dict(episodic_weight=0.0, reward_scale=1.0)
+_OWN_START = dict(start="method")  # wherever an environment has V start
 OF_METHOD: dict[str, dict[str, Any]] = {
-    "h-official": _AS_PUBLISHED | dict(bonus="histogram", mixing="step", leave_own_out=False),
-    **{name: _AS_PUBLISHED | dict(bonus=name) for name in BASELINES},
+    **{name: _OWN_START for name in ("h", "la")},
+    "h-official": _AS_PUBLISHED
+    | _OWN_START
+    | dict(bonus="histogram", mixing="step", leave_own_out=False),
+    **{name: _AS_PUBLISHED | _OWN_START | dict(bonus=name) for name in BASELINES},
 }
 
 # What the paper does, and how a run that does otherwise says so.

@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from maxent_jax.choices import ENVS, ConfigError
+from maxent_jax.choices import ENVS, METHODS, ConfigError
 from maxent_jax.config import Config, preset
 from maxent_jax.presets import PRESETS
 
@@ -75,6 +75,12 @@ def test_quick_names_its_deviations_and_paper_has_none():
     assert preset("paper").deviations() == {}
     named = preset("quick").deviations()
     assert {"torque_limit", "end_flipped", "shaping", "yaw_copies", "reward"} <= set(named)
+
+
+def test_an_environment_that_has_v_start_from_scratch_leaves_the_others_their_own_start():
+    starts = {m: preset("quick", env="walker2d", method=m).start for m in METHODS}
+    assert starts.pop("v") == "scratch"
+    assert set(starts.values()) == {"method"}
 
 
 def test_configs_of_all_methods_share_one_program():
