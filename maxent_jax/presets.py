@@ -119,7 +119,7 @@ PLAIN: dict[str, Any] = dict(shaping=0.0, shaping_survives_death=False, return_s
 _AS_PUBLISHED: dict[str, Any] = PLAIN | dict(episodic_weight=0.0, reward_scale=1.0)
 _OWN_START = dict(start="method")  # wherever an environment has V start
 OF_METHOD: dict[str, dict[str, Any]] = {
-    **{name: _OWN_START for name in ("h", "la")},
+    **dict.fromkeys(("h", "la"), _OWN_START),
     "h-official": _AS_PUBLISHED
     | _OWN_START
     | dict(bonus="histogram", mixing="step", leave_own_out=False),
