@@ -165,12 +165,12 @@ def test_an_archived_policy_keeps_the_moments_that_it_was_trained_with():
         state, _ = call("end", config, before)
         learner = state.learner.agent
         archived = mixture.policy(state.archive, state.archive.size - 1)
-        assert leaves_equal(archived.normalizer, learner.parameters.normalizer)
+        assert leaves_equal(archived.moments, learner.parameters.moments)
         assert leaves_equal(archived.actor, learner.average)
-        known_at_the_start = begun.learner.agent.parameters.normalizer.number
-        assert float(archived.normalizer.number - known_at_the_start) == 400
+        known_at_the_start = begun.learner.agent.parameters.moments.weight
+        assert float(archived.moments.weight - known_at_the_start) == pytest.approx(400)
         assert state.iteration == 1 or leaves_equal(acts(before), acts(state))
-    first, second = (mixture.policy(state.archive, jnp.asarray(i)).normalizer for i in (1, 2))
+    first, second = (mixture.policy(state.archive, jnp.asarray(i)).moments for i in (1, 2))
     assert not leaves_equal(first, second)
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.special import digamma
 
-from maxent_jax import bonuses
-from maxent_jax.bonuses import Setting, Steps, kmeans, moments, ngu, particles, rise, vcse
+from maxent_jax import bonuses, moments
+from maxent_jax.bonuses import Setting, Steps, kmeans, ngu, particles, rise, vcse
 
 D, A, B = 3, 2, 24
 SCALE = np.array([0.5, 2.0, 10.0], np.float32)
@@ -175,6 +175,16 @@ def test_moments_are_those_of_all_that_was_met():
     # Measured: 3e-6. The prior weighs 1e-4 of 301.
     np.testing.assert_allclose(running.mean, everything.mean(0), rtol=1e-5)
     np.testing.assert_allclose(running.variance, everything.var(0), rtol=1e-5)
+
+
+def test_what_is_normalized_has_mean_0_and_deviation_1_and_is_cut_far_off():
+    met = np.stack([np.full(8, 7.0), np.tile([1.0, -1.0], 4)], axis=1).astype(np.float32)
+    unchanged = moments.normalized(moments.init((2,)), jnp.array([[3.0, -2.0]]), 10)
+    np.testing.assert_array_equal(unchanged, [[3, -2]])
+    known = moments.update(moments.init((2,)), jnp.asarray(met))
+    near, far = moments.normalized(known, jnp.array([[7.05, 0.5], [7.0, 1e6]]), 10)
+    np.testing.assert_allclose(near, [5, 0.5], rtol=1e-2)  # the first never varied
+    np.testing.assert_allclose(far, [0, 10], atol=1e-2)
 
 
 def test_moments_leave_out_rows_that_are_not_valid():

@@ -13,12 +13,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from maxent_jax.bonuses import icm, moments, particles
+from maxent_jax import moments
+from maxent_jax.bonuses import icm, particles
 from maxent_jax.bonuses.descent import Learned
 from maxent_jax.bonuses.icm import Icm
-from maxent_jax.bonuses.moments import Moments
 from maxent_jax.bonuses.protocol import Bonus, Setting, Steps
 from maxent_jax.choices import NEIGHBORS
+from maxent_jax.moments import Moments
 from maxent_jax.types import Metrics
 
 NUM_NEIGHBORS = NEIGHBORS["apt"]  # knn_k of URLB

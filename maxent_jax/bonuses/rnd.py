@@ -14,10 +14,11 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from maxent_jax.bonuses import descent, moments, protocol
+from maxent_jax import moments
+from maxent_jax.bonuses import descent, protocol
 from maxent_jax.bonuses.descent import Learned
-from maxent_jax.bonuses.moments import Moments
 from maxent_jax.bonuses.protocol import HIDDEN_LAYERS, HIDDEN_SIZE, Bonus, Setting, Steps
+from maxent_jax.moments import Moments
 from maxent_jax.sac.networks import Mlp
 from maxent_jax.types import Metrics
 

@@ -6,18 +6,21 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from maxent_jax import moments
 from maxent_jax.config import Config
-from maxent_jax.sac import losses, normalizer
+from maxent_jax.moments import Moments
+from maxent_jax.sac import losses
 from maxent_jax.sac.networks import Actor, Critic, Inputs
-from maxent_jax.sac.normalizer import Normalizer
 from maxent_jax.types import Metrics
+
+LARGEST_INPUT = 10.0  # deviations; a state far from all that were seen is cut off there
 
 
 class Policy(NamedTuple):
     """What acting takes."""
 
     actor: Any
-    normalizer: Normalizer | None  # of the inputs; None: they pass unchanged
+    moments: Moments | None  # of the inputs; None: they pass unchanged
 
 
 class Parameters(NamedTuple):
@@ -27,12 +30,12 @@ class Parameters(NamedTuple):
     critic: Any
     target_critic: Any
     log_temperature: jax.Array  # []
-    normalizer: Normalizer | None = None
+    moments: Moments | None = None  # of the inputs, [I]
 
     @property
     def policy(self) -> Policy:
         """The actor, with the moments of the inputs that it was trained on."""
-        return Policy(self.actor, self.normalizer)
+        return Policy(self.actor, self.moments)
 
 
 class Agent(NamedTuple):
@@ -92,7 +95,7 @@ def init(sac: Sac, key: jax.Array) -> Agent:
             critic=critic,
             target_critic=jax.tree.map(jnp.copy, critic),  # two buffers, so both can be donated
             log_temperature=jnp.log(jnp.asarray(sac.initial_temperature, jnp.float32)),
-            normalizer=normalizer.init(inputs.shape[-1]) if sac.normalizes else None,
+            moments=moments.init(inputs.shape) if sac.normalizes else None,
         ),
     )
 
@@ -106,10 +109,10 @@ def restart(sac: Sac, parameters: Parameters) -> Agent:
 def see(sac: Sac, agent: Agent, observation: jax.Array, counts: jax.Array) -> Agent:
     """With the moments of its inputs after those states [N, D] that count, [N] bool."""
     parameters = agent.parameters
-    if parameters.normalizer is None:
+    if parameters.moments is None:
         return agent
-    moved = normalizer.add(parameters.normalizer, sac.inputs(observation), counts)
-    return agent._replace(parameters=parameters._replace(normalizer=moved))
+    moved = moments.update(parameters.moments, sac.inputs(observation), counts)
+    return agent._replace(parameters=parameters._replace(moments=moved))
 
 
 def archived(agent: Agent) -> Parameters:
@@ -123,7 +126,7 @@ def act(
     sac: Sac, policy: Policy, observation: jax.Array, key: jax.Array, deterministic: bool = False
 ) -> jax.Array:
     """An action drawn from the policy, or its mean: [..., D] -> [..., A] in [-1, 1]."""
-    mean, log_std = _policy(sac, policy.actor, _inputs(sac, policy.normalizer, observation))
+    mean, log_std = _policy(sac, policy.actor, _inputs(sac, policy.moments, observation))
     if deterministic:
         return jnp.tanh(mean)
     return jnp.tanh(mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape))
@@ -131,7 +134,7 @@ def act(
 
 def value(sac: Sac, parameters: Parameters, observation: jax.Array, key: jax.Array) -> jax.Array:
     """The critics' estimate of a state's soft value by one action drawn, [..., D] -> [...]."""
-    inputs = _inputs(sac, parameters.normalizer, observation)
+    inputs = _inputs(sac, parameters.moments, observation)
     action, log_prob = losses.sample_action(*_policy(sac, parameters.actor, inputs), key)
     values = _values(sac, parameters.target_critic, inputs, action)
     surprise = log_prob + (sac.target_entropy if sac.lagrangian else 0.0)
@@ -142,7 +145,7 @@ def update(sac: Sac, agent: Agent, batch: losses.Batch, key: jax.Array) -> tuple
     """One gradient step of critics, actor and temperature, and of the target critics after them."""
     key_next, key_actor = jax.random.split(key)
     parameters = agent.parameters
-    inputs = _inputs(sac, parameters.normalizer, batch.observation)
+    inputs = _inputs(sac, parameters.moments, batch.observation)
     target = _target(sac, parameters, batch, key_next)
 
     def critic_loss(critic):
@@ -186,9 +189,11 @@ def update(sac: Sac, agent: Agent, batch: losses.Batch, key: jax.Array) -> tuple
     return Agent(learned, optimizer, average), metrics
 
 
-def _inputs(sac: Sac, moments: Normalizer | None, observation: jax.Array) -> jax.Array:
+def _inputs(sac: Sac, of_inputs: Moments | None, observation: jax.Array) -> jax.Array:
     inputs = sac.inputs(observation)
-    return inputs if moments is None else normalizer.apply(moments, inputs)
+    if of_inputs is None:
+        return inputs
+    return moments.normalized(of_inputs, inputs, LARGEST_INPUT)
 
 
 def _policy(sac: Sac, actor: Any, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:

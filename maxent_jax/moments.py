@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 # What mean 0 and variance 1 weigh before the first batch, as in the code of RND and in URLB.
 PRIOR_WEIGHT = 1e-4
+SMALLEST_DEVIATION = 1e-2
 
 
 class Moments(NamedTuple):
@@ -46,3 +47,16 @@ def update(moments: Moments, batch: jax.Array, valid: jax.Array | None = None) -
         variance=spread + share * (1 - share) * change**2,
         weight=moments.weight + weight,
     )
+
+
+def normalized(moments: Moments, values: jax.Array, largest: float) -> jax.Array:
+    """[..., *S] with mean 0 and deviation 1 over what was met, and none beyond ± largest.
+
+    What hardly varied, by less than SMALLEST_DEVIATION, is not blown up.
+
+    Args:
+      moments: of shape [*S].
+    """
+    deviation = jnp.maximum(jnp.sqrt(moments.variance), SMALLEST_DEVIATION)
+    mean, deviation = (jnp.broadcast_to(x, values.shape) for x in (moments.mean, deviation))
+    return jnp.clip((values - mean) / deviation, -largest, largest)
