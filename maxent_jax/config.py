@@ -228,11 +228,14 @@ def preset(name: str, **changes: Any) -> Config:
             choices.check_choice("setting", change, DEFAULTS)
         except ConfigError as error:
             raise choices.ConfigTypeError(str(error)) from None
-    choices.check_env(changes.get("env", Config.env))
-    choices.check_choice("method", changes.get("method", Config.method), choices.METHODS)
-    in_env = presets.IN_ENV.get((name, changes.get("env", Config.env)), {})
-    of_method = presets.OF_METHOD.get(changes.get("method", Config.method), {})
-    return Config(**{"preset": name, **presets.PRESETS[name], **in_env, **of_method, **changes})
+    env, method = changes.get("env", Config.env), changes.get("method", Config.method)
+    choices.check_env(env)
+    choices.check_choice("method", method, choices.METHODS)
+    in_env = presets.IN_ENV.get((name, env), {})
+    of_method = presets.OF_METHOD.get(method, {})
+    of_both = presets.OF_METHOD_IN_ENV.get((name, env, method), {})
+    settings = presets.PRESETS[name] | in_env | of_method | of_both
+    return Config(**{"preset": name, **settings, **changes})
 
 
 def _time_limit(env: str) -> tuple[int, str]:
