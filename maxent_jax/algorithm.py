@@ -143,7 +143,17 @@ def train_segment(config: Config, state: State) -> tuple[State, Metrics]:
     key, key_steps = jax.random.split(state.key)
     keys = jax.random.split(key_steps, config.vector_steps)
     learner, metrics = jax.lax.scan(step, state.learner, keys)
-    return state._replace(key=key, learner=learner), reduce_metrics(metrics)
+    archive = state.archive
+    if config.snapshots > 1:
+        archive = mixture.append(archive, agent.archived(learner.agent), _due(config, learner))
+    return state._replace(key=key, learner=learner, archive=archive), reduce_metrics(metrics)
+
+
+def _due(config: Config, learner: Learner) -> jax.Array:
+    """Whether a snapshot is taken after this segment; that of an iteration's last is `end`'s."""
+    segments = learner.env_steps // (config.vector_steps * config.num_envs)
+    within = segments % config.num_segments
+    return (within > 0) & (within % (config.num_segments // config.snapshots) == 0)
 
 
 @in_32_bits

@@ -77,8 +77,8 @@ class Run:
     @property
     def weights(self) -> np.ndarray:
         """[P] of the mixture's policies, 0 for empty slots."""
-        if self.config.weights == CORRECTIVE and self.num_policies > 1:
-            return self.metrics["mixture_weights"][self.num_policies - 2].astype(np.float32)
+        if self.config.weights == CORRECTIVE and len(self.metrics.get("mixture_weights", ())):
+            return self.metrics["mixture_weights"][-1].astype(np.float32)
         return np.asarray(methods.make(self.config).weights[self.num_policies - 1])
 
     @property

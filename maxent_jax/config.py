@@ -39,6 +39,8 @@ class Config:
     """N: environments stepped together."""
     num_segments: int = 15
     """Parts of an iteration; progress is shown after each."""
+    snapshots: int = 1
+    """Policies that an iteration archives, evenly over its segments, the last at its end."""
     plateau_segments: int = 0
     """End an iteration before its budget is spent once its reward has stopped rising, judged by
     means over so many segments; 0: never."""
@@ -173,8 +175,8 @@ class Config:
 
     @property
     def archive_size(self) -> int:
-        """P: the initial policy and one an iteration."""
-        return self.num_iterations + 1
+        """P: the initial policy and those that each iteration archives."""
+        return 1 + self.num_iterations * self.snapshots
 
     @property
     def simulates_in_jax(self) -> bool:
@@ -258,6 +260,7 @@ _CHOICES = {
 }
 _AT_LEAST_ONE = (
     *("num_seeds", "num_iterations", "steps_per_iteration", "num_envs", "num_segments"),
+    *("snapshots",),
     *("episode_length", "num_starts", "num_neighbors", "reference_size", "mixture_episodes"),
     *("hidden_layers", "hidden_size", "batch_size", "replay_size", "return_steps"),
 )
@@ -436,6 +439,14 @@ def _check_together(c: Config) -> None:
         (
             c.yaw_copies and c.replay_dtype != "float32",
             f"replay-dtype is {c.replay_dtype}, but yaw copies need states in float32.",
+        ),
+        (
+            c.num_segments % c.snapshots > 0,
+            f"snapshots is {c.snapshots}, but must divide num-segments, {c.num_segments}.",
+        ),
+        (
+            c.snapshots > 1 and c.plateau_segments > 0,
+            "snapshots is above 1, but an iteration that may end at a plateau archives one policy.",
         ),
         (
             c.mixture_episodes < c.archive_size,

@@ -26,13 +26,14 @@ def init(parameters: Parameters, capacity: int) -> Archive:
     return Archive(empty, jnp.zeros((), jnp.int32))
 
 
-def append(archive: Archive, parameters: Parameters) -> Archive:
-    """With one more policy. Beyond the last slot nothing is stored."""
+def append(archive: Archive, parameters: Parameters, due: jax.Array | bool = True) -> Archive:
+    """With one more policy if `due`, [] bool. Beyond the last slot nothing is stored."""
+    capacity = jax.tree.leaves(archive.parameters)[0].shape[0]
+    slot = jnp.where(due, archive.size, capacity)
     stored = jax.tree.map(
-        lambda slots, x: slots.at[archive.size].set(x, mode="drop"), archive.parameters, parameters
+        lambda slots, x: slots.at[slot].set(x, mode="drop"), archive.parameters, parameters
     )
-    capacity = jax.tree.leaves(stored)[0].shape[0]
-    return Archive(stored, jnp.minimum(archive.size + 1, capacity))
+    return Archive(stored, jnp.minimum(archive.size + due, capacity))
 
 
 def policy(archive: Archive, index: jax.Array) -> Parameters:

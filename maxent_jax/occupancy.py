@@ -197,20 +197,21 @@ def score(
     Args:
       points: [M, F] the reference.
       rows: [M] int32, which row of the occupancy each point is; -1 for none. A state does not see
-        itself, nor, with leave_own_out, any state of its own policy, unless that leaves fewer than
-        k. Points of a history carry no row: a state that entered it is not told apart.
+        itself, nor, with leave_own_out, any state of its own policy or of others that the same
+        iteration archived, unless that leaves fewer than k. Points of a history carry no row: a state that entered it is not told apart.
       archive: whose policies are scored.
       num_filled: [] how many of the points are there; all when left out.
     """
     config = parts.config
     num_rows = occupancy.policy.shape[0]
     capacity = jax.tree.leaves(archive.parameters)[0].shape[0]
-    label = capacity + jnp.arange(num_rows, dtype=jnp.int32)  # by itself, or by its policy
+    label = capacity + jnp.arange(num_rows, dtype=jnp.int32)  # by itself, or by its iteration
     if config.leave_own_out:
-        owner = jnp.where(rows < 0, -1, occupancy.policy[rows])
+        iteration = (occupancy.policy + config.snapshots - 1) // config.snapshots
+        owner = jnp.where(rows < 0, -1, iteration[rows])
         others = jnp.sum(owner[None] != jnp.arange(capacity)[:, None], axis=1)  # [P]
         alone = others < config.num_neighbors
-        label = jnp.where(alone[occupancy.policy], label, occupancy.policy)
+        label = jnp.where(alone[iteration], label, iteration)
     point_label = jnp.where(rows < 0, NONE_EXCLUDED - 1, label[rows])
     distance = knn_distances(
         occupancy.features,

@@ -141,6 +141,7 @@ PAPER: dict[str, tuple[Any, str]] = {
     "shaping": (0.0, "the reward is shaped by a potential"),
     "shaping_survives_death": (False, "the potential survives death: not policy-invariant"),
     "pooled": (False, "the reference is drawn from the pooled states of the mixture"),
+    "snapshots": (1, "an iteration archives more than one policy"),
     "bonus": ("none", "SAC is not paid by the distance to the reference"),
     "mixing": ("episode", "a policy of the mixture is drawn for each step"),
     "deterministic": (False, "policies are evaluated by their mean actions"),

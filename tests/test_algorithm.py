@@ -174,6 +174,21 @@ def test_an_archived_policy_keeps_the_moments_that_it_was_trained_with():
     assert not leaves_equal(first, second)
 
 
+def test_an_iteration_archives_its_snapshots_as_they_act_at_that_moment():
+    config = tiny(num_iterations=1, num_segments=4, snapshots=2)
+    state = algorithm.start(config)
+    state, _ = call("begin", config, state)
+    after = []
+    for _ in range(4):
+        state, _ = call("train_segment", config, state)
+        after.append(state.learner.agent.parameters)
+    state, metrics = call("end", config, state)
+    assert state.archive.size == config.archive_size == 3
+    assert leaves_equal(mixture.policy(state.archive, jnp.asarray(1)), after[1])
+    assert leaves_equal(mixture.policy(state.archive, jnp.asarray(2)), after[3])
+    np.testing.assert_allclose(metrics["mixture_weights"], 1 / 3, rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_fully_corrective_weights_are_measured_on_episodes_that_they_were_not_fitted_to(
     monkeypatch,

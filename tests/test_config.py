@@ -58,6 +58,11 @@ def test_presets_are_valid_in_every_environment_and_survive_a_round_trip(name, e
         (dict(method="h-official", start="best"), "none is the best to start from"),
         (dict(plateau_segments=2), "at most half of num-segments = 2"),
         (dict(plateau_tolerance=-0.1), "0 or more"),
+        (dict(snapshots=3), "must divide num-segments, 2"),
+        (
+            dict(snapshots=2, num_segments=4, plateau_segments=2, mixture_episodes=8),
+            "archives one policy",
+        ),
     ],
 )
 def test_a_bad_value_is_refused_by_name(changes, words):

@@ -59,7 +59,7 @@ def headline(seeds: Sequence[Run]) -> dict[str, Any]:
     """A sentence about a run, and its figures: means over the seeds."""
     first = seeds[0]
     cells = f"of {first.parts.grid.num_cells:,}"
-    trained = f"{first.num_policies - 1} of {first.config.num_iterations} policies trained"
+    trained = f"{first.num_policies - 1} of {first.config.archive_size - 1} policies trained"
     kind = "1 seed" if len(seeds) == 1 else f"{len(seeds)} seeds, of which these are the means"
     tiles = (
         ("cells, training", "cumulative_coverage", ",.0f", cells),
