@@ -198,7 +198,8 @@ def score(
       points: [M, F] the reference.
       rows: [M] int32, which row of the occupancy each point is; -1 for none. A state does not see
         itself, nor, with leave_own_out, any state of its own policy or of others that the same
-        iteration archived, unless that leaves fewer than k. Points of a history carry no row: a state that entered it is not told apart.
+        iteration archived, unless that leaves fewer than k. Points of a history carry no row: a
+        state that entered it is not told apart.
       archive: whose policies are scored.
       num_filled: [] how many of the points are there; all when left out.
     """

@@ -294,9 +294,7 @@ def expected_scores(found, points, rows, config, size, capacity=4):
 @pytest.mark.parametrize("source", ["mixture", "history"])
 @pytest.mark.parametrize(("num_policies", "snapshots"), [(1, 1), (3, 1), (3, 2)])
 def test_scores_are_those_by_hand(key, leave_own_out, source, num_policies, snapshots):
-    config = preset(
-        "smoke", leave_own_out=leave_own_out, reward_distance=0.5, snapshots=snapshots
-    )
+    config = preset("smoke", leave_own_out=leave_own_out, reward_distance=0.5, snapshots=snapshots)
     found = hand_made(key, num_policies)
     rows = jax.random.permutation(key, jnp.flatnonzero(found.alive))[:NUM_POINTS]
     points = found.features[rows]
