@@ -88,7 +88,15 @@ _ROBOTS: dict[str, dict[str, Any]] = {
 }
 # A policy needs about 120,000 gradient steps to learn to walk.
 _BUDGETS = {
-    "walker2d": dict(num_iterations=3, steps_per_iteration=480_000, replay_size=480_000),
+    "walker2d": dict(
+        num_iterations=3,
+        num_envs=128,
+        steps_per_iteration=960_000,
+        updates_per_step=0.125,
+        replay_size=960_000,
+        snapshots=3,
+        mixture_episodes=64,
+    ),
 }
 
 # What a preset does otherwise in some environment.

@@ -8,10 +8,12 @@ import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import nbformat
 import numpy as np
 import pytest
 from nbclient import NotebookClient
+from untrained import make_run
 
 import maxent_jax
 from maxent_jax import analysis, features, runs
@@ -19,6 +21,7 @@ from maxent_jax.analysis import Paths
 from maxent_jax.choices import ConfigError
 from maxent_jax.commands import evaluate
 from maxent_jax.config import preset
+from maxent_jax.moments import Moments
 
 ROOT = Path(__file__).parent.parent
 NOTEBOOK = ROOT / "docs" / "analysis.ipynb"
@@ -102,6 +105,24 @@ def test_an_exported_policy_acts_without_this_package(run, visited, tmp_path):
     # Half of all draws lie below the action at the Gaussian's mean, whatever its spread; 5 standard
     # deviations of 0.5 / sqrt(4000).
     np.testing.assert_allclose(below, 0.5, atol=0.04)
+
+
+def test_an_exported_policy_sees_inputs_normalized_by_its_own_moments():
+    run = make_run(env="pendulum", normalize_inputs=True)
+    plain = make_run(env="pendulum")  # the same weights
+    mean, deviation = jnp.array([[0.5, -0.2, 3.0]]), jnp.array([[0.5, 0.25, 2.0]])
+    stacked = (run.num_policies, 1)
+    seen = Moments(
+        jnp.tile(mean, stacked), jnp.tile(deviation**2, stacked), jnp.full(run.num_policies, 9.0)
+    )
+    archive = run.mixture._replace(parameters=run.mixture.parameters._replace(moments=seen))
+    run = dataclasses.replace(run, mixture=archive)
+    states = jax.random.normal(jax.random.key(3), (16, 3))
+    found = run.export_policy(1, deterministic=True).call(states)
+    by_hand = (states - mean) / deviation
+    expected = plain.export_policy(1, deterministic=True).call(by_hand)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert np.abs(found - plain.export_policy(1, deterministic=True).call(states)).max() > 0.01
 
 
 def test_no_such_policy_is_exported(run):
