@@ -63,16 +63,9 @@ PRESETS: dict[str, dict[str, Any]] = {
 _LOCOMOTION = dict(
     shaping=100.0,
     shaping_space="position",
-    shaping_survives_death=True,
+    lagrangian_entropy=True,
     reward_distance=20.0,
     reward_scale=8.0,
-)
-# For a robot that a bad step can kill: death brings no gain, and living has no cost.
-_UPRIGHT = _LOCOMOTION | dict(
-    shaping_survives_death=False,
-    lagrangian_entropy=True,
-    normalize_inputs=True,
-    actor_average=1e-3,
 )
 _CLASSIC = dict(episode_length=200)
 _ROBOTS: dict[str, dict[str, Any]] = {
@@ -83,7 +76,7 @@ _ROBOTS: dict[str, dict[str, Any]] = {
         yaw_copies=1,
         **_LOCOMOTION,
     ),
-    "walker2d": _UPRIGHT,
+    "walker2d": dict(normalize_inputs=True, actor_average=1e-3, **_LOCOMOTION),
     "humanoid": dict(policy_inputs="heading", **_LOCOMOTION),
 }
 # A policy needs about 120,000 gradient steps to learn to walk.
@@ -120,7 +113,7 @@ IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
 }
 
 # The learner of methods as their authors published them, and of the baselines, whatever the preset.
-PLAIN: dict[str, Any] = dict(shaping=0.0, shaping_survives_death=False, return_steps=1)
+PLAIN: dict[str, Any] = dict(shaping=0.0, return_steps=1)
 # Bonuses are divided by their deviation; the distance to the reference has its own scale instead.
 _AS_PUBLISHED: dict[str, Any] = PLAIN | dict(episodic_weight=0.0, reward_scale=1.0)
 OF_METHOD: dict[str, dict[str, Any]] = {

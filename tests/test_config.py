@@ -80,6 +80,7 @@ def test_quick_names_its_deviations_and_paper_has_none():
     assert preset("paper").deviations() == {}
     named = preset("quick").deviations()
     assert {"torque_limit", "end_flipped", "shaping", "yaw_copies", "reward"} <= set(named)
+    assert "shaping_survives_death" not in named
 
 
 def test_an_environment_that_has_v_start_from_scratch_leaves_the_others_their_own_start():
