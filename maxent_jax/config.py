@@ -260,7 +260,7 @@ _CHOICES = {
 }
 _AT_LEAST_ONE = (
     *("num_seeds", "num_iterations", "steps_per_iteration", "num_envs", "num_segments"),
-    *("snapshots",),
+    "snapshots",
     *("episode_length", "num_starts", "num_neighbors", "reference_size", "mixture_episodes"),
     *("hidden_layers", "hidden_size", "batch_size", "replay_size", "return_steps"),
 )
