@@ -52,7 +52,7 @@ class StopAt(Interruption):
     [
         dict(method="h"),
         dict(method="la", refresh_period=10),
-        dict(normalize_inputs=True, actor_average=0.01),
+        dict(normalize_inputs=True, actor_average=0.01, snapshots=2),
     ],
     ids=["h", "la", "v"],
 )
