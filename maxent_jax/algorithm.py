@@ -1,7 +1,7 @@
 """Algorithm 1, for every method: pure functions from state to state.
 
     begin          roll the mixture out, define r_t from it, choose the agent to start from
-    train_segment  a fixed number of env steps with their updates
+    train_segment  a fixed number of env steps with their updates; archives a snapshot if one is due
     end            archive the agent, evaluate the mixture
 
 `iterate` composes them and `run` scans `iterate` as one program; a driver that logs and saves in
@@ -134,7 +134,10 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
 
 @in_32_bits
 def train_segment(config: Config, state: State) -> tuple[State, Metrics]:
-    """`config.vector_steps` steps of all envs with their gradient steps (step 4)."""
+    """`config.vector_steps` steps of all envs with their gradient steps (step 4).
+
+    Afterwards archives a snapshot of the agent if one is due.
+    """
     p = parts.make(config)
 
     def step(learner, key):

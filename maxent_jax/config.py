@@ -446,7 +446,8 @@ def _check_together(c: Config) -> None:
         ),
         (
             c.snapshots > 1 and c.plateau_segments > 0,
-            "snapshots is above 1, but an iteration that may end at a plateau archives one policy.",
+            f"snapshots is {c.snapshots}, but must be 1 with plateau-segments above 0: "
+            "an iteration that may end at a plateau archives one policy.",
         ),
         (
             c.mixture_episodes < c.archive_size,
