@@ -14,8 +14,7 @@ BRAX_ENVS = (
     *("ant", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum"),
     *("inverted_double_pendulum", "pusher", "reacher", "swimmer", "walker2d"),
 )
-TORSO_ENVS = ("ant", "humanoid")  # a floating torso has a heading, and can be upside down
-TURNING_ENVS = ("ant",)  # whose observation we know how to turn about the vertical
+TORSO_ENVS = ("ant", "humanoid")  # a floating torso has a heading, turns, can be upside down
 BONUSES = ("rnd", "icm", "ngu", "re3", "rise", "renyi", "vcse", "kmeans", "apt", "histogram")
 BASELINES = BONUSES[:-1]  # methods that one policy learns, paid by the bonus of that name
 NEIGHBORS = {"re3": 3, "rise": 5, "renyi": 5, "vcse": 12, "apt": 12}  # k, within a batch

@@ -380,7 +380,7 @@ def _check_together(c: Config) -> None:
             f"policy-inputs is heading, but {c.env} has no floating torso with a heading.",
         ),
         (
-            c.yaw_copies and c.env not in choices.TURNING_ENVS,
+            c.yaw_copies and c.env not in choices.TORSO_ENVS,
             f"yaw-copies is {c.yaw_copies}, but {c.env} cannot be turned about the vertical.",
         ),
         (

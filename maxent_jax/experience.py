@@ -214,7 +214,7 @@ def _variants(parts: Parts, state: jax.Array, angle: jax.Array | None) -> jax.Ar
 
 
 def _rotated(parts: Parts, state: jax.Array, angle: jax.Array) -> jax.Array:
-    assert parts.torso is not None and parts.torso.rotate is not None  # checked by Config
+    assert parts.torso is not None  # checked by Config
     state = jnp.broadcast_to(state, (*angle.shape, state.shape[-1]))
     return parts.torso.rotate(state, angle)
 

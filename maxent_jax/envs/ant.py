@@ -55,5 +55,5 @@ TASK = Task(
         bins=(100, 100),
     ),
     fast=Options("Euler", substeps=2, iterations=4, ls_iterations=8, max_contacts=6),
-    torso=torso.make(num_positions=15, num_velocities=14, rotates=True),
+    torso=torso.make(num_positions=15, num_velocities=14),
 )

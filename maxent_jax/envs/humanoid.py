@@ -27,10 +27,47 @@ from maxent_jax.envs.task import Task
 HEALTHY_HEIGHT = (1.0, 2.0)  # metres, Humanoid-v4
 RESET_NOISE = 1e-2  # Humanoid-v4
 DERIVED = ("cinert", "cvel", "qfrc_actuator", "cfrc_ext")
+NUM_BODIES, NUM_VELOCITIES = 14, 23
 
 
 def observe(state: PhysicsState, derived: Derived) -> jax.Array:
     return jnp.concatenate([state.qpos, state.qvel, *(derived[name] for name in DERIVED)], axis=-1)
+
+
+def rotate_derived(derived: jax.Array, angle: jax.Array) -> jax.Array:
+    """The derived fields [..., 331] with the world turned by `angle` [...] about the vertical.
+
+    An actuator's force does not know the world's axes; all else are tensors and vectors in them.
+    """
+    sizes = (10 * NUM_BODIES, 6 * NUM_BODIES, NUM_VELOCITIES)
+    cinert, cvel, force, contact = jnp.split(derived, [sum(sizes[: n + 1]) for n in range(3)], -1)
+    angle = angle[..., None]
+
+    def turn_vectors(field: jax.Array) -> jax.Array:
+        vectors = field.reshape(*field.shape[:-1], -1, 3)
+        return torso.turn_vector(vectors, angle).reshape(field.shape)
+
+    bodies = cinert.reshape(*cinert.shape[:-1], NUM_BODIES, 10)
+    inertia, offset, mass = jnp.split(bodies, [6, 9], -1)
+    turned = [_turn_inertia(inertia, angle), torso.turn_vector(offset, angle), mass]
+    cinert = jnp.concatenate(turned, -1).reshape(cinert.shape)
+    return jnp.concatenate([cinert, turn_vectors(cvel), force, turn_vectors(contact)], -1)
+
+
+def _turn_inertia(inertia: jax.Array, angle: jax.Array) -> jax.Array:
+    """[..., 6], in MuJoCo's order: the tensor's xx, yy, zz, xy, xz, yz."""
+    xx, yy, zz, xy, xz, yz = jnp.moveaxis(inertia, -1, 0)
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    mixed = 2 * cos * sin * xy
+    turned = [
+        cos**2 * xx + sin**2 * yy - mixed,
+        sin**2 * xx + cos**2 * yy + mixed,
+        zz,
+        cos * sin * (xx - yy) + (cos**2 - sin**2) * xy,
+        cos * xz - sin * yz,
+        sin * xz + cos * yz,
+    ]
+    return jnp.stack(turned, -1)
 
 
 def healthy(observation: jax.Array) -> jax.Array:
@@ -55,5 +92,5 @@ TASK = Task(
     ),
     derived=DERIVED,
     fast=Options("Euler", iterations=4, ls_iterations=8, max_contacts=8),
-    torso=torso.make(num_positions=24, num_velocities=23, rotates=False),
+    torso=torso.make(24, NUM_VELOCITIES, rotate_derived),
 )

@@ -14,27 +14,38 @@ import jax.numpy as jnp
 
 POSITION_UNIT = 10.0  # metres; a policy sees distances beyond it by their logarithm
 
+Turn = Callable[[jax.Array, jax.Array], jax.Array]  # ([..., D], angle [...]) -> [..., D]
+
 
 class Torso(NamedTuple):
     """What a floating torso offers beside its observation [..., D]."""
 
     flipped: Callable[[jax.Array], jax.Array]  # -> [...] bool: upside down
     heading_inputs: Callable[[jax.Array], jax.Array]  # -> [..., I], see heading_inputs
-    rotate: Callable[[jax.Array, jax.Array], jax.Array] | None  # turn the world, see rotate
+    rotate: Turn  # the world, see rotate
 
 
-def make(num_positions: int, num_velocities: int, rotates: bool) -> Torso:
+def make(num_positions: int, num_velocities: int, rotate_derived: Turn | None = None) -> Torso:
     """For an observation that begins with so many positions and velocities.
 
     Args:
-      rotates: nothing but these positions and velocities is observed, so that rotate knows all.
+      rotate_derived: turns what is observed beyond them, [..., D - positions - velocities].
     """
+    num_own = num_positions + num_velocities
+
+    def rotate_all(observation: jax.Array, angle: jax.Array) -> jax.Array:
+        turned = rotate(observation[..., :num_own], angle, num_positions)
+        if rotate_derived is None:
+            return turned
+        derived = rotate_derived(observation[..., num_own:], angle)
+        return jnp.concatenate([turned, derived], axis=-1)
+
     return Torso(
         flipped=flipped,
         heading_inputs=functools.partial(
             heading_inputs, num_positions=num_positions, num_velocities=num_velocities
         ),
-        rotate=functools.partial(rotate, num_positions=num_positions) if rotates else None,
+        rotate=rotate_all,
     )
 
 
@@ -60,7 +71,7 @@ def heading_inputs(observation: jax.Array, num_positions: int, num_velocities: i
     w, x, y, z = _quaternion(observation)
     yaw = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     position = observation[..., :2]
-    seen = _turn(position, -yaw)
+    seen = turn_vector(position, -yaw)
     radius = jnp.linalg.norm(position, axis=-1, keepdims=True)
     shrink = jnp.log1p(radius / POSITION_UNIT) / jnp.maximum(radius, 1e-6)
     up = up_axis(observation)
@@ -72,10 +83,8 @@ def heading_inputs(observation: jax.Array, num_positions: int, num_velocities: i
             seen / (radius + 0.1),  # bounded, and continuous at the origin
             jnp.stack([jnp.sin(yaw), jnp.cos(yaw)], -1),
             observation[..., 2:3],
-            _turn(up[..., :2], -yaw),
-            up[..., 2:],
-            _turn(velocity[..., :2], -yaw),
-            velocity[..., 2:3],
+            turn_vector(up, -yaw),
+            turn_vector(velocity[..., :3], -yaw),
             observation[..., 7:num_positions],
             velocity[..., 3:],
         ],
@@ -104,12 +113,10 @@ def rotate(observation: jax.Array, angle: jax.Array, num_positions: int) -> jax.
     velocity = observation[..., num_positions:]
     return jnp.concatenate(
         [
-            _turn(observation[..., :2], angle),
-            observation[..., 2:3],
+            turn_vector(observation[..., :3], angle),
             turned,
             observation[..., 7:num_positions],
-            _turn(velocity[..., :2], angle),
-            velocity[..., 2:],
+            turn_vector(velocity, angle),
         ],
         axis=-1,
     )
@@ -122,7 +129,9 @@ def _quaternion(observation: jax.Array) -> tuple[jax.Array, ...]:
     return tuple(jnp.moveaxis(quaternion, -1, 0))
 
 
-def _turn(vector: jax.Array, angle: jax.Array) -> jax.Array:
+def turn_vector(vector: jax.Array, angle: jax.Array) -> jax.Array:
+    """[..., 2 or more]: the first two turned by an angle [...] in radians, the others as before."""
     x, y = vector[..., 0], vector[..., 1]
     cos, sin = jnp.cos(angle), jnp.sin(angle)
-    return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+    horizontal = jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+    return jnp.concatenate([horizontal, vector[..., 2:]], axis=-1)
