@@ -1,9 +1,9 @@
 """What the replay keeps of training: each state once, with its distances to the reference.
 
-An item is a step. It holds the state that the step reached, and points at the one that it left: the
-item of the step before or, for an episode's first, an entry of the pool of starts. Of copies, whole
-episodes turned by a yaw, only the angles and what is measured are stored: the states are turned
-when drawn.
+An item is a step. It holds what the networks see of the state that the step reached, and points at
+the one that it left: the item of the step before or, for an episode's first, an entry of the pool
+of starts. Of copies, whole episodes turned by a yaw, only the angles and what is measured are
+stored: the states are turned when drawn.
 """
 
 from typing import NamedTuple
@@ -11,7 +11,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from maxent_jax.config import Config
 from maxent_jax.density.knn import knn_distances
 from maxent_jax.parts import Parts
 from maxent_jax.sac import replay
@@ -34,7 +33,7 @@ class Reference(NamedTuple):
 class Step(NamedTuple):
     """An item of the replay; V = 1 + yaw copies variants of a step, the first unturned."""
 
-    state: jax.Array  # [D] reached, float32 or float16
+    state: jax.Array  # [num_seen] of the state reached, float32 or float16
     features: jax.Array  # [V, F] of it, float32
     previous: jax.Array  # [] int32: the item with the state left, or -1 - its row in the starts
     following: jax.Array  # [] int32: the episode's next item, -1 where there is none
@@ -50,7 +49,7 @@ def init(parts: Parts) -> Replay:
     config = parts.config
     scalar, variants = jnp.zeros(()), jnp.zeros(1 + config.yaw_copies)
     step = Step(
-        state=jnp.zeros(parts.sac.observation_size, config.replay_dtype),
+        state=jnp.zeros(parts.num_seen, config.replay_dtype),
         features=jnp.zeros((1 + config.yaw_copies, len(parts.phi.names))),
         previous=jnp.zeros((), jnp.int32),
         following=jnp.zeros((), jnp.int32),
@@ -88,7 +87,7 @@ def add(
         angle = jnp.where(goes_on, ring.items.angle[jnp.maximum(previous, 0)], angle)
     after = _variants(parts, transition.next_observation, angle)
     step = Step(
-        state=_encoded(config, transition.next_observation),
+        state=_encoded(parts, transition.next_observation),
         features=after,
         previous=previous,
         following=jnp.full_like(previous, -1),
@@ -110,6 +109,8 @@ def sample(
 ) -> Experience:
     """Drawn uniformly with replacement: [*shape, ...] items, with the steps that follow each.
 
+    Of observations, what the networks see: [*shape, num_seen].
+
     Args:
       starts: [R, D] the pool of states from which the episodes began.
     """
@@ -125,7 +126,8 @@ def sample(
     last, steps = rows[-1], jnp.stack(rows, axis=-1)
 
     in_ring, row, start = _address(items.previous[first])
-    observation = jnp.where(in_ring[..., None], items.state[row].astype(jnp.float32), starts[start])
+    from_start = starts[:, : parts.num_seen][start]
+    observation = jnp.where(in_ring[..., None], items.state[row].astype(jnp.float32), from_start)
     next_observation = items.state[last].astype(jnp.float32)
     before = _features_left(parts, items, starts, first)
     variant = jnp.zeros(shape, jnp.int32)
@@ -224,8 +226,9 @@ def _chosen(values: jax.Array, index: jax.Array, axis: int = -1) -> jax.Array:
     return jnp.take_along_axis(values, jnp.expand_dims(index, axis), axis).squeeze(axis)
 
 
-def _encoded(config: Config, state: jax.Array) -> jax.Array:
-    if config.replay_dtype == "float32":
-        return state
-    largest = jnp.finfo(config.replay_dtype).max
-    return jnp.clip(state, -largest, largest).astype(config.replay_dtype)
+def _encoded(parts: Parts, state: jax.Array) -> jax.Array:
+    dtype, seen = parts.config.replay_dtype, state[..., : parts.num_seen]
+    if dtype == "float32":
+        return seen
+    largest = jnp.finfo(dtype).max
+    return jnp.clip(seen, -largest, largest).astype(dtype)

@@ -91,7 +91,7 @@ def of_a_seed(config: Config) -> dict[str, int]:
     actor = nbytes(state.archive.parameters.actor) // c.archive_size
     actors = c.mixture_episodes * actor if c.mixing == "episode" else 0
     large = policy >= LARGE_POLICY
-    num_dims = learner.episodes.starts.obs.shape[-1]
+    num_dims = parts.make(config).num_seen
     drawn = c.updates_per_vector_step * c.batch_size
     visited = c.mixture_episodes * c.episode_length * _bytes_of_a_visit(c)
     begin_or_end = {

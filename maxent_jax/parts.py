@@ -26,6 +26,7 @@ class Parts(NamedTuple):
     env: Env
     grid: Grid
     torso: Torso | None
+    num_seen: int  # entries of a state, the first ones, that the networks see
     sac: agent.Sac
     phi: Features
     bonus: Bonus | None = None
@@ -45,11 +46,12 @@ def _make(config: Config) -> Parts:
             names = ("torque_limit", "end_flipped", "end_unhealthy")
             deviations = {name: getattr(config, name) for name in names}
         env = entry.make(config.backend, config.physics, **deviations)
+        num_dims = num_seen = observation_size(env)
         inputs = lambda observation: observation
         if config.policy_inputs == "heading":
             assert entry.torso is not None  # checked by Config
-            inputs = entry.torso.heading_inputs
-        sac = agent.make(config, observation_size(env), env.action_size, inputs)
+            inputs, num_seen = entry.torso.heading_inputs, entry.torso.num_seen
+        sac = agent.make(config, num_dims, env.action_size, inputs)
         phi = make_feature_map(config.env)
         bonus = None
         if config.bonus != "none":
@@ -62,7 +64,7 @@ def _make(config: Config) -> Parts:
                 config.learning_rate,
                 entry.grid.num_cells,
             )
-        return Parts(config, env, entry.grid, entry.torso, sac, phi, bonus)
+        return Parts(config, env, entry.grid, entry.torso, num_seen, sac, phi, bonus)
 
 
 def _units(config: Config, grid: Grid, num_features: int) -> jax.Array:

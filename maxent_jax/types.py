@@ -61,8 +61,8 @@ class Outcomes(NamedTuple):
 class Experience(NamedTuple):
     """What the learner draws from the replay, see experience.py: n steps of one episode."""
 
-    observation: jax.Array  # [..., D] before the first
+    observation: jax.Array  # [..., num_seen] before the first
     action: jax.Array  # [..., A] the first, in [-1, 1]
-    next_observation: jax.Array  # [..., D] after the last that was taken
+    next_observation: jax.Array  # [..., num_seen] after the last that was taken
     outcomes: Outcomes  # [..., n]
     row: jax.Array  # [...] int32, of the first step in the replay

@@ -17,15 +17,15 @@ STARTS = 5
 
 
 def make(**changes):
-    """Ant with a small ring; the environment itself is not stepped."""
+    """A small ring, Ant's unless said; the environment itself is not stepped."""
     sizes = dict(num_envs=NUM_ENVS, replay_size=CAPACITY, batch_size=4)
     budget = dict(updates_per_step=1.0, steps_per_iteration=NUM_ENVS * 15)
     return parts.make(preset("quick", **{**sizes, **budget, "return_steps": 1, **changes}))
 
 
-def states(rng, num):
-    """Random states of Ant whose quaternions have unit length."""
-    drawn = rng.standard_normal((num, SIZE)).astype(np.float32)
+def states(rng, num, size=SIZE):
+    """Random states of a robot whose quaternions have unit length."""
+    drawn = rng.standard_normal((num, size)).astype(np.float32)
     drawn[:, 3:7] /= np.linalg.norm(drawn[:, 3:7], axis=1, keepdims=True)
     return drawn
 
@@ -39,19 +39,20 @@ def reference(rng, features):
 def filled(p, num_steps, seed=0, invalid=0.1):
     """A ring after so many steps of all envs, and the full transitions that it was told of."""
     rng = np.random.default_rng(seed)
-    starts, measured_against = states(rng, STARTS), reference(rng, len(p.phi.names))
+    size, num_actions = p.sac.observation_size, p.sac.action_size
+    starts, measured_against = states(rng, STARTS, size), reference(rng, len(p.phi.names))
     add = jax.jit(functools.partial(experience.add, p))
     ring = experience.init(p)
     start = rng.integers(0, STARTS, NUM_ENVS)
     current, place = starts[start], -1 - start
     told = []
     for step in range(num_steps):
-        reached = states(rng, NUM_ENVS)
+        reached = states(rng, NUM_ENVS, size)
         terminated, truncated = rng.random((2, NUM_ENVS)) < 0.15
         valid = rng.random(NUM_ENVS) >= invalid
         terminated |= ~valid
         reached = np.where(valid[:, None], reached, current)
-        action = rng.uniform(-1, 1, (NUM_ENVS, 8)).astype(np.float32)
+        action = rng.uniform(-1, 1, (NUM_ENVS, num_actions)).astype(np.float32)
         bonus = rng.random(NUM_ENVS).astype(np.float32)
         transition = Transition(current, action, reached, terminated, truncated, valid)
         ring, rows = add(
@@ -93,26 +94,32 @@ def assert_measured(p, against, drawn):
     )
 
 
-@pytest.mark.parametrize("num_steps", [1, 4, 8, 9, 31], ids="{} steps".format)
-def test_what_is_drawn_is_what_happened(num_steps):
-    """Both ends of each transition, also after the ring went round, with episodes that ended."""
-    p = make(yaw_copies=0)
+@pytest.mark.parametrize(
+    ("env", "num_steps"), [*(("ant", n) for n in (1, 4, 8, 9, 31)), ("humanoid", 31)]
+)
+def test_what_is_drawn_is_what_happened(env, num_steps):
+    """Both ends of each transition, also after the ring went round, with episodes that ended.
+
+    Of a Humanoid's, whose networks see the heading's frame, the positions and velocities.
+    """
+    p = make(env=env, yaw_copies=0)
+    seen = {"ant": 29, "humanoid": 47}[env]
     ring, starts, _, told = filled(p, num_steps)
     drawn = drawn_from(p, ring, starts, 400)
     which = index_of(drawn, told)
     observation, _, reached, terminated, bonus = (
         np.stack(column)[which] for column in zip(*told, strict=True)
     )
-    np.testing.assert_array_equal(drawn.observation, observation)
-    np.testing.assert_array_equal(drawn.next_observation, reached)
+    np.testing.assert_array_equal(drawn.observation, observation[:, :seen])
+    np.testing.assert_array_equal(drawn.next_observation, reached[:, :seen])
     np.testing.assert_array_equal(drawn.outcomes.terminated[:, 0], terminated)
     np.testing.assert_array_equal(drawn.outcomes.bonus[:, 0], bonus)
     assert drawn.outcomes.taken.all()
     # to rounding: the programs that made them sum in another order
     exact = {"rtol": 1e-5, "atol": 1e-6}
     outcomes = jax.tree.map(lambda x: x[:, 0], drawn.outcomes)  # of the only step
-    np.testing.assert_allclose(outcomes.features, p.phi(drawn.observation), **exact)
-    np.testing.assert_allclose(outcomes.next_features, p.phi(drawn.next_observation), **exact)
+    np.testing.assert_allclose(outcomes.features, p.phi(observation), **exact)
+    np.testing.assert_allclose(outcomes.next_features, p.phi(reached), **exact)
 
 
 @pytest.mark.parametrize("num_steps", [4, 31], ids=["part full", "gone round"])
@@ -197,9 +204,13 @@ def bytes_of(config):
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
 
 
-@pytest.mark.parametrize(("dtype", "most"), [("float32", 1.7e9), ("float16", 0.9e9)])
-def test_a_million_transitions_of_humanoid_stay_within_their_memory(dtype, most):
-    config = preset("quick", env="humanoid", replay_size=1_000_000, replay_dtype=dtype)
+@pytest.mark.parametrize(
+    ("inputs", "dtype", "most"),
+    [("state", "float32", 1.7e9), ("state", "float16", 0.9e9), ("heading", "float32", 0.32e9)],
+)
+def test_a_million_transitions_of_humanoid_stay_within_their_memory(inputs, dtype, most):
+    changes = dict(replay_size=1_000_000, replay_dtype=dtype, policy_inputs=inputs)
+    config = preset("quick", env="humanoid", **changes)
     assert 0.9 * most < bytes_of(config) <= most
 
 

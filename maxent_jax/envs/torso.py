@@ -20,9 +20,10 @@ Turn = Callable[[jax.Array, jax.Array], jax.Array]  # ([..., D], angle [...]) ->
 class Torso(NamedTuple):
     """What a floating torso offers beside its observation [..., D]."""
 
+    num_seen: int  # entries of it, the first ones, that heading_inputs looks at
     flipped: Callable[[jax.Array], jax.Array]  # -> [...] bool: upside down
     heading_inputs: Callable[[jax.Array], jax.Array]  # -> [..., I], see heading_inputs
-    rotate: Turn  # the world, see rotate
+    rotate: Turn  # the world, see rotate; of [..., num_seen] too
 
 
 def make(num_positions: int, num_velocities: int, rotate_derived: Turn | None = None) -> Torso:
@@ -31,16 +32,17 @@ def make(num_positions: int, num_velocities: int, rotate_derived: Turn | None = 
     Args:
       rotate_derived: turns what is observed beyond them, [..., D - positions - velocities].
     """
-    num_own = num_positions + num_velocities
+    num_seen = num_positions + num_velocities
 
     def rotate_all(observation: jax.Array, angle: jax.Array) -> jax.Array:
-        turned = rotate(observation[..., :num_own], angle, num_positions)
-        if rotate_derived is None:
+        turned = rotate(observation[..., :num_seen], angle, num_positions)
+        if rotate_derived is None or observation.shape[-1] == num_seen:
             return turned
-        derived = rotate_derived(observation[..., num_own:], angle)
+        derived = rotate_derived(observation[..., num_seen:], angle)
         return jnp.concatenate([turned, derived], axis=-1)
 
     return Torso(
+        num_seen=num_seen,
         flipped=flipped,
         heading_inputs=functools.partial(
             heading_inputs, num_positions=num_positions, num_velocities=num_velocities

@@ -15,7 +15,7 @@ from typing import Any
 from maxent_jax.choices import ConfigError
 from maxent_jax.config import Config
 
-SCHEMA = 5  # of the directory, checkpoints included
+SCHEMA = 6  # of the directory, checkpoints included
 CONFIG, METRICS, FIGURES = "config.json", "metrics.jsonl", "figures"
 # All that any entry point writes there.
 WRITTEN = (
