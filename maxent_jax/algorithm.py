@@ -256,9 +256,6 @@ def _start(
     candidates = dict(scratch=scratch, last=last, best=restored)
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *(candidates[name] for name in methods.STARTS))
     chosen = jax.tree.map(lambda x: x[method.start], stacked)
-    if p.config.restart_actor:
-        fresh = scratch.parameters.actor
-        chosen = agent.restart(p.sac, chosen.parameters._replace(actor=fresh))
     if not p.config.restart_temperature:
         return chosen
     initial = scratch.parameters.log_temperature

@@ -149,8 +149,6 @@ class Config:
     actor_average: float = 0.0
     """Rate at which an average follows the actor, update by update; the average is archived. 0: the
     actor itself is."""
-    restart_actor: bool = False
-    """Start each iteration with an untrained actor, whatever agent it starts from."""
     restart_temperature: bool = False
     """Put α back to its initial value at the start of each iteration."""
 

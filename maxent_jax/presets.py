@@ -164,6 +164,5 @@ PAPER: dict[str, tuple[Any, str]] = {
     "lagrangian_entropy": (False, "the soft return counts entropy from its target"),
     "normalize_inputs": (False, "networks see inputs of mean 0 and deviation 1"),
     "actor_average": (0.0, "an average of the actor over its updates is archived"),
-    "restart_actor": (False, "the actor restarts in each iteration"),
     "restart_temperature": (False, "the temperature restarts in each iteration"),
 }

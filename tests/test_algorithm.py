@@ -135,21 +135,6 @@ def test_h_starts_from_scratch_la_goes_on_and_v_from_the_best():
         assert not leaves_equal(archived.actor, begun.learner.agent.parameters.actor)
 
 
-def test_a_fresh_actor_joins_the_critics_of_the_agent_that_an_iteration_starts_from():
-    config = tiny(restart_actor=True)
-    state = algorithm.start(config)
-    for part in ("begin", "train_segment", "end"):
-        state, _ = call(part, config, state)
-    begun, metrics = call("begin", config, state)
-    best = mixture.policy(state.archive, metrics["best_policy"])
-    found = begun.learner.agent.parameters
-    assert leaves_equal(best.critic, found.critic)
-    assert leaves_equal(best.target_critic, found.target_critic)
-    for i in range(2):
-        archived = mixture.policy(state.archive, jnp.asarray(i))
-        assert not leaves_equal(archived.actor, found.actor)
-
-
 def test_an_archived_policy_keeps_the_moments_that_it_was_trained_with():
     config = tiny(normalize_inputs=True, actor_average=0.1)
     p, state = parts.make(config), algorithm.start(config)

@@ -329,6 +329,25 @@ def test_what_methods_differ_in_as_a_number_is_an_axis():
     assert (drawn[0][-1][:, 1] == 6).all()
 
 
+def test_several_environments_have_a_row_each_and_one_has_all_axes():
+    def group(env, method, seeds):
+        names = (*(axis for axis, _, _ in paper_figures.AXES), *dict(paper_figures.QUANTITIES))
+        return env, method, {name: np.ones((seeds, 2)) for name in names}
+
+    several = [group("ant", "V", 3), group("ant", "H", 3), group("walker2d", "V", 5)]
+    figure = paper_figures.curves(several, "title")
+    assert len(figure.axes) == 2 * len(paper_figures.QUANTITIES)
+    first_of_rows = figure.axes[:: len(paper_figures.QUANTITIES)]
+    assert [ax.get_ylabel() for ax in first_of_rows] == ["ant", "walker2d"]
+    assert [len(ax.get_lines()) for ax in first_of_rows] == [2, 1]
+    assert figure.axes[-1].get_xlabel() == "thousand env steps"
+    assert figure.get_suptitle().endswith("seeds: ant 3, walker2d 5")
+
+    figure = paper_figures.curves(several[:2], "title")
+    assert len(figure.axes) == len(paper_figures.QUANTITIES) * len(paper_figures.AXES)
+    assert figure.get_suptitle().endswith("3 seeds")
+
+
 def test_the_raw_values_are_those_of_the_runs(finished):
     out, _ = finished
     with open(out / "fig4" / "raw.csv") as file:

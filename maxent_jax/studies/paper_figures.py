@@ -15,9 +15,11 @@ from maxent_jax.density import histogram
 from maxent_jax.studies.raw import RANDOM
 from maxent_jax.studies.statistics import interquartile_mean, interval_of_curves
 
-AXES = (
+Axis = tuple[str, str, float]  # a column, what it is called, and its factor
+ENV_STEPS: Axis = ("env_steps", "thousand env steps", 1e-3)
+AXES: tuple[Axis, ...] = (
     ("iteration", "iteration", 1),
-    ("env_steps", "thousand env steps", 1e-3),
+    ENV_STEPS,
     ("gradient_steps", "thousand gradient steps", 1e-3),
     ("wall_seconds", "wall-clock (minutes)", 1 / 60),
 )
@@ -72,27 +74,37 @@ def classic_weights(found: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]])
 
 
 def curves(groups: Sequence[tuple[str, str, Columns]], title: str) -> Figure:
-    """Fig. 4: interquartile means with their intervals against all four axes; rows for each env."""
+    """Fig. 4: interquartile means with their intervals.
+
+    Of one environment, a row for each quantity and a column for each axis. Of several, as in the
+    paper: a row for each environment, and a column for each quantity against env steps.
+    """
     envs = list(dict.fromkeys(env for env, _, _ in groups))
-    rows = [(env, quantity) for env in envs for quantity in QUANTITIES]
-    figure = Figure(figsize=(13, 2.7 * len(rows)), layout="constrained")
-    axes = figure.subplots(len(rows), len(AXES), sharey="row", squeeze=False)
+    if len(envs) > 1:
+        panels = [[(env, *quantity, ENV_STEPS) for quantity in QUANTITIES] for env in envs]
+    else:
+        panels = [[(envs[0], *quantity, axis) for axis in AXES] for quantity in QUANTITIES]
+    figure = Figure(figsize=(13, 2.7 * len(panels)), layout="constrained")
+    axes = figure.subplots(len(panels), len(panels[0]), squeeze=False).tolist()
     styles = _styles([method for _, method, _ in groups])
     opacity = 0.2 if len(styles) <= len(OTHERS) else 0.06
-    for (env, (name, label)), row in zip(rows, axes, strict=True):
-        for _, method, columns in (group for group in groups if group[0] == env):
-            if name in columns:
-                _draw(row, columns, name, opacity, label=method, **styles[method])
-        row[0].set_ylabel(label if len(envs) == 1 else f"{env}: {label}")
-        row[0].set_ylim(bottom=0)
-    for ax, (_, label, _) in zip(axes[-1], AXES, strict=True):
-        ax.set_xlabel(label)
-    for ax in axes[:, 0]:
-        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    handles, labels = axes[0, 0].get_legend_handles_labels()
+    for row, of_row in zip(axes, panels, strict=True):
+        for ax, (env, name, label, axis) in zip(row, of_row, strict=True):
+            for _, method, columns in (group for group in groups if group[0] == env):
+                if name in columns:
+                    _draw(ax, columns, name, axis, opacity, label=method, **styles[method])
+            ax.set_ylim(bottom=0)
+            ax.set_xlabel(axis[1] if row is axes[-1] else "")
+            if axis[0] == "iteration":
+                ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+            if len(envs) > 1:
+                row[0].set_ylabel(env)
+                ax.set_title(label if row is axes[0] else "")
+            else:
+                row[0].set_ylabel(label)
+    handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, frameon=False, ncols=6, loc="outside lower center")
-    seeds = max(len(columns["env_steps"]) for _, _, columns in groups)
-    figure.suptitle(f"{title}: interquartile mean of {seeds} seeds, 95 % bootstrap interval")
+    figure.suptitle(f"{title}: interquartile mean, 95 % bootstrap interval; {_seeds(groups)}")
     return figure
 
 
@@ -130,8 +142,7 @@ def along(
             ax.set_xlim(x[0] - 0.2 * smallest, 1.3 * x[-1])
             ax.set(title=quantity, xlabel=label)
             ax.grid(alpha=0.25)
-    seeds = max(len(columns["env_steps"]) for _, _, columns in groups)
-    figure.suptitle(f"{title}: interquartile mean of {seeds} seeds, 95 % bootstrap interval")
+    figure.suptitle(f"{title}: interquartile mean, 95 % bootstrap interval; {_seeds(groups)}")
     return figure
 
 
@@ -151,16 +162,23 @@ def occupancies(directories: Mapping[str, Path]) -> Figure:
     return figure
 
 
-def _draw(row: Sequence[Axes], columns: Columns, name: str, opacity: float, **style: Any) -> None:
+def _seeds(groups: Sequence[tuple[str, str, Columns]]) -> str:
+    numbers = {env: len(columns["env_steps"]) for env, _, columns in groups}
+    if len(set(numbers.values())) == 1:
+        return f"{min(numbers.values())} seeds"
+    return "seeds: " + ", ".join(f"{env} {number}" for env, number in numbers.items())
+
+
+def _draw(ax: Axes, columns: Columns, name: str, axis: Axis, opacity: float, **style: Any) -> None:
+    quantity, _, factor = axis
     middle, low, high = interval_of_curves(columns[name])
-    for ax, (axis, _, factor) in zip(row, AXES, strict=True):
-        ax.grid(alpha=0.25)
-        if style["label"] == RANDOM and axis == "gradient_steps":
-            ax.axhline(middle[-1], linestyle=":", lw=1, color=style["color"])
-            continue
-        x = columns[axis].mean(0) * factor
-        ax.plot(x, middle, marker="o", ms=3, **style)
-        ax.fill_between(x, low, high, color=style["color"], alpha=opacity, lw=0)
+    ax.grid(alpha=0.25)
+    if style["label"] == RANDOM and quantity == "gradient_steps":
+        ax.axhline(middle[-1], linestyle=":", lw=1, color=style["color"])
+        return
+    x = columns[quantity].mean(0) * factor
+    ax.plot(x, middle, marker="o", ms=3, **style)
+    ax.fill_between(x, low, high, color=style["color"], alpha=opacity, lw=0)
 
 
 def _band(

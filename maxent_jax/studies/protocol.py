@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from maxent_jax import integrity, runs
-from maxent_jax.choices import BASELINES, CLASSIC_ENVS, UsageError
+from maxent_jax.choices import BASELINES, CLASSIC_ENVS, MUJOCO_ENVS, UsageError
 from maxent_jax.config import DEFAULTS, Config, preset
 from maxent_jax.presets import PLAIN
 from maxent_jax.runs import locks
@@ -44,8 +44,7 @@ class Scale(NamedTuple):
     """How much of a study is run."""
 
     preset: str
-    num_seeds: int
-    envs: tuple[str, ...]
+    num_seeds: Mapping[str, int]  # by environment
     changes: Mapping[str, Any] = MappingProxyType({})  # of the preset, in every cell
 
 
@@ -60,20 +59,21 @@ class Study(NamedTuple):
     along: str = ""  # the number that the methods differ in: see reproduced.ALONG
 
 
-TOY = Scale("smoke", 2, ("pendulum",))
+TOY = Scale("smoke", {"pendulum": 2})
 ROBOT = {
     "toy": TOY,
-    "cpu": Scale("quick", 3, ("ant",)),
-    "paper": Scale("paper", 5, ("ant",)),
+    "cpu": Scale("quick", {"ant": 3}),
+    "paper": Scale("paper", {"ant": 5}),
 }
 CLASSIC = {  # on two cores an iteration of ten seeds takes minutes: two of them, in one environment
     "toy": TOY,
-    "cpu": Scale("quick", 10, ("pendulum",), {"num_iterations": 2}),
-    "paper": Scale("paper", 10, CLASSIC_ENVS),
+    "cpu": Scale("quick", {"pendulum": 10}, {"num_iterations": 2}),
+    "paper": Scale("paper", dict.fromkeys(CLASSIC_ENVS, 10)),
 }
 THREE: dict[str, Changes] = {name.upper(): {"method": name} for name in ("h", "la", "v")}
+THREE["H"]["random_baseline"] = True  # beside the first method alone: see raw.read
 # Ablations of what an iteration does, not of what the iterations add up to, end after two of them.
-ABLATION = ROBOT | {"cpu": Scale("quick", 3, ("ant",), {"num_iterations": 2})}
+ABLATION = ROBOT | {"cpu": Scale("quick", {"ant": 3}, {"num_iterations": 2})}
 # A method's own choice is left to the method: see `home`.
 REFRESHED: dict[str, Changes] = {
     "every 1": {"method": "la"},
@@ -87,7 +87,11 @@ STUDIES: dict[str, Study] = {
     "fig4": Study(
         "H, LA and V, beside a random policy",
         THREE,
-        ROBOT | {"paper": Scale("paper", 5, ("ant", "walker2d", "humanoid"))},
+        {
+            "toy": TOY,
+            "cpu": Scale("quick", {"ant": 3, "walker2d": 5, "humanoid": 3}),
+            "paper": Scale("paper", dict.fromkeys(MUJOCO_ENVS, 5)),
+        },
     ),
     "weights": Study(
         "weights of the mixture; all else is V's",
@@ -136,7 +140,7 @@ STUDIES: dict[str, Study] = {
             "health": {"end_flipped": False},
             "nothing": {"end_flipped": False, "end_unhealthy": False},
         },
-        ABLATION | {"toy": TOY._replace(envs=("ant",))},
+        ABLATION | {"toy": TOY._replace(num_seeds={"ant": 2})},
     ),
     "published": Study(
         "H and LA as published, and as the paper reads them, all with one plain learner",
@@ -161,19 +165,21 @@ def make(study: str, scale: str, num_seeds: int | None = None) -> list[Cell]:
     """The cells of a study at a scale, all methods of a seed before the next seed."""
     chosen = STUDIES[study]
     at = chosen.scales[scale]
-    seeds = at.num_seeds if num_seeds is None else num_seeds
-    width = seeds if chosen.together else 1
+    seeds = {
+        env: number if num_seeds is None else num_seeds for env, number in at.num_seeds.items()
+    }
+
+    def cell(method: str, env: str, seed: int) -> Cell:
+        width = seeds[env] if chosen.together else 1
+        own = {"env": env, "seed": seed, "num_seeds": width}
+        return Cell(method, preset(at.preset, **own, **at.changes, **chosen.methods[method]))
+
     return [
-        Cell(
-            method,
-            preset(
-                at.preset,
-                **{"env": env, "seed": seed, "num_seeds": width, **at.changes, **changes},
-            ),
-        )
-        for seed in range(0, seeds, width)
-        for env in at.envs
-        for method, changes in chosen.methods.items()
+        cell(method, env, seed)
+        for seed in range(max(seeds.values()))
+        for env in seeds
+        if (seed == 0 if chosen.together else seed < seeds[env])
+        for method in chosen.methods
     ]
 
 
