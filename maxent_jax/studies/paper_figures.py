@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -85,7 +85,7 @@ def curves(groups: Sequence[tuple[str, str, Columns]], title: str) -> Figure:
     else:
         panels = [[(envs[0], *quantity, axis) for axis in AXES] for quantity in QUANTITIES]
     figure = Figure(figsize=(13, 2.7 * len(panels)), layout="constrained")
-    share = "none" if len(envs) > 1 else "row"  # a row is then one quantity
+    share: Literal["none", "row"] = "none" if len(envs) > 1 else "row"  # of one quantity
     axes = figure.subplots(len(panels), len(panels[0]), sharey=share, squeeze=False).tolist()
     styles = _styles([method for _, method, _ in groups])
     opacity = 0.2 if len(styles) <= len(OTHERS) else 0.06
