@@ -93,7 +93,7 @@ _LONG: dict[str, Any] = dict(
     snapshots=3,
     mixture_episodes=64,
 )
-# To learn to walk takes Walker2d about 120,000 gradient steps, and Humanoid 200,000.
+# An iteration has 120,000 gradient steps on Walker2d, 240,000 on Humanoid: enough to learn to walk.
 _BUDGETS = {
     "walker2d": dict(num_iterations=3, updates_per_step=0.125, **_LONG),
     # A random policy's steps cost as much as the agent's: a quarter of the time here.

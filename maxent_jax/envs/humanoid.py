@@ -16,6 +16,8 @@
 The world is one of the 14 bodies of the last fields; its entries are 0.
 """
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 
@@ -37,10 +39,10 @@ def observe(state: PhysicsState, derived: Derived) -> jax.Array:
 def rotate_derived(derived: jax.Array, angle: jax.Array) -> jax.Array:
     """The derived fields [..., 331] with the world turned by `angle` [...] about the vertical.
 
-    An actuator's force does not know the world's axes; all else are tensors and vectors in them.
+    Actuator forces stay as they are. All other fields are tensors and vectors in the world's axes.
     """
-    sizes = (10 * NUM_BODIES, 6 * NUM_BODIES, NUM_VELOCITIES)
-    cinert, cvel, force, contact = jnp.split(derived, [sum(sizes[: n + 1]) for n in range(3)], -1)
+    ends = itertools.accumulate((10 * NUM_BODIES, 6 * NUM_BODIES, NUM_VELOCITIES))
+    cinert, cvel, force, contact = jnp.split(derived, list(ends), -1)
     angle = angle[..., None]
 
     def turn_vectors(field: jax.Array) -> jax.Array:

@@ -23,7 +23,7 @@ class Torso(NamedTuple):
     num_seen: int  # entries of it, the first ones, that heading_inputs looks at
     flipped: Callable[[jax.Array], jax.Array]  # -> [...] bool: upside down
     heading_inputs: Callable[[jax.Array], jax.Array]  # -> [..., I], see heading_inputs
-    rotate: Turn  # the world, see rotate; of [..., num_seen] too
+    rotate: Turn  # turns the world, see rotate; also takes the first num_seen entries alone
 
 
 def make(num_positions: int, num_velocities: int, rotate_derived: Turn | None = None) -> Torso:

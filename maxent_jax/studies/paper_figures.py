@@ -1,6 +1,7 @@
 """The figures of a reproduction, from values and runs alone."""
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,6 +17,7 @@ from maxent_jax.studies.raw import RANDOM
 from maxent_jax.studies.statistics import interquartile_mean, interval_of_curves
 
 Axis = tuple[str, str, float]  # a column, what it is called, and its factor
+Band = tuple[np.ndarray, ...]  # middle, low, high; [iterations] each
 ENV_STEPS: Axis = ("env_steps", "thousand env steps", 1e-3)
 AXES: tuple[Axis, ...] = (
     ("iteration", "iteration", 1),
@@ -80,30 +82,39 @@ def curves(groups: Sequence[tuple[str, str, Columns]], title: str) -> Figure:
     paper: a row for each environment, and a column for each quantity against env steps.
     """
     envs = list(dict.fromkeys(env for env, _, _ in groups))
-    if len(envs) > 1:
+    several = len(envs) > 1
+    if several:
         panels = [[(env, *quantity, ENV_STEPS) for quantity in QUANTITIES] for env in envs]
     else:
         panels = [[(envs[0], *quantity, axis) for axis in AXES] for quantity in QUANTITIES]
     figure = Figure(figsize=(13, 2.7 * len(panels)), layout="constrained")
-    share: Literal["none", "row"] = "none" if len(envs) > 1 else "row"  # of one quantity
-    axes = figure.subplots(len(panels), len(panels[0]), sharey=share, squeeze=False).tolist()
+    share: Literal["none", "row"] = "none" if several else "row"
+    axes = figure.subplots(len(panels), len(panels[0]), sharey=share, squeeze=False)
     styles = _styles([method for _, method, _ in groups])
     opacity = 0.2 if len(styles) <= len(OTHERS) else 0.06
-    for row, of_row in zip(axes, panels, strict=True):
-        for ax, (env, name, label, axis) in zip(row, of_row, strict=True):
-            for _, method, columns in (group for group in groups if group[0] == env):
-                if name in columns:
-                    _draw(ax, columns, name, axis, opacity, label=method, **styles[method])
-            ax.set_ylim(bottom=0)
-            ax.set_xlabel(axis[1] if row is axes[-1] else "")
-            if axis[0] == "iteration":
-                ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-            if len(envs) > 1:
-                row[0].set_ylabel(env)
-                ax.set_title(label if row is axes[0] else "")
-            else:
-                row[0].set_ylabel(label)
-    handles, labels = axes[0][0].get_legend_handles_labels()
+    bands = {
+        (env, method, name): interval_of_curves(columns[name])
+        for env, method, columns in groups
+        for name, _ in QUANTITIES
+        if name in columns
+    }
+    for ax, (env, name, _, axis) in zip(axes.flat, chain(*panels), strict=True):
+        for at, method, columns in groups:
+            if at == env and name in columns:
+                band = bands[env, method, name]
+                _draw(ax, columns, band, axis, opacity, label=method, **styles[method])
+        ax.set_ylim(bottom=0)
+    for ax, (_, _, _, axis) in zip(axes[-1], panels[-1], strict=True):
+        ax.set_xlabel(axis[1])
+    for ax, ((env, _, label, _), *_) in zip(axes[:, 0], panels, strict=True):
+        ax.set_ylabel(env if several else label)
+    if several:
+        for ax, (_, _, label, _) in zip(axes[0], panels[0], strict=True):
+            ax.set_title(label)
+    else:
+        for ax in axes[:, 0]:  # against iterations
+            ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, frameon=False, ncols=6, loc="outside lower center")
     figure.suptitle(f"{title}: interquartile mean, 95 % bootstrap interval; {_seeds(groups)}")
     return figure
@@ -170,9 +181,9 @@ def _seeds(groups: Sequence[tuple[str, str, Columns]]) -> str:
     return "seeds: " + ", ".join(f"{env} {number}" for env, number in numbers.items())
 
 
-def _draw(ax: Axes, columns: Columns, name: str, axis: Axis, opacity: float, **style: Any) -> None:
+def _draw(ax: Axes, columns: Columns, band: Band, axis: Axis, opacity: float, **style: Any) -> None:
     quantity, _, factor = axis
-    middle, low, high = interval_of_curves(columns[name])
+    middle, low, high = band
     ax.grid(alpha=0.25)
     if style["label"] == RANDOM and quantity == "gradient_steps":
         ax.axhline(middle[-1], linestyle=":", lw=1, color=style["color"])

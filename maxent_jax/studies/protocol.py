@@ -70,8 +70,11 @@ CLASSIC = {  # on two cores an iteration of ten seeds takes minutes: two of them
     "cpu": Scale("quick", {"pendulum": 10}, {"num_iterations": 2}),
     "paper": Scale("paper", dict.fromkeys(CLASSIC_ENVS, 10)),
 }
-THREE: dict[str, Changes] = {name.upper(): {"method": name} for name in ("h", "la", "v")}
-THREE["H"]["random_baseline"] = True  # beside the first method alone: see raw.read
+THREE: dict[str, Changes] = {
+    "H": {"method": "h", "random_baseline": True},  # raw.read takes the first method's
+    "LA": {"method": "la"},
+    "V": {"method": "v"},
+}
 # Ablations of what an iteration does, not of what the iterations add up to, end after two of them.
 ABLATION = ROBOT | {"cpu": Scale("quick", {"ant": 3}, {"num_iterations": 2})}
 # A method's own choice is left to the method: see `home`.
@@ -165,21 +168,20 @@ def make(study: str, scale: str, num_seeds: int | None = None) -> list[Cell]:
     """The cells of a study at a scale, all methods of a seed before the next seed."""
     chosen = STUDIES[study]
     at = chosen.scales[scale]
-    seeds = {
-        env: number if num_seeds is None else num_seeds for env, number in at.num_seeds.items()
-    }
-
-    def cell(method: str, env: str, seed: int) -> Cell:
-        width = seeds[env] if chosen.together else 1
-        own = {"env": env, "seed": seed, "num_seeds": width}
-        return Cell(method, preset(at.preset, **own, **at.changes, **chosen.methods[method]))
-
+    seeds = at.num_seeds if num_seeds is None else dict.fromkeys(at.num_seeds, num_seeds)
+    widths = seeds if chosen.together else dict.fromkeys(seeds, 1)
     return [
-        cell(method, env, seed)
+        Cell(
+            method,
+            preset(
+                at.preset,
+                **{"env": env, "seed": seed, "num_seeds": widths[env], **at.changes, **changes},
+            ),
+        )
         for seed in range(max(seeds.values()))
         for env in seeds
-        if (seed == 0 if chosen.together else seed < seeds[env])
-        for method in chosen.methods
+        if seed in range(0, seeds[env], widths[env])
+        for method, changes in chosen.methods.items()
     ]
 
 
