@@ -2,6 +2,8 @@
 
 import copy
 import importlib.util
+import os
+import shutil
 import sysconfig
 from pathlib import Path
 
@@ -44,6 +46,11 @@ class BuildVariants(build_ext):
     """Side by side, each with object files of its own: the sources have the same names."""
 
     def build_extension(self, ext: Extension) -> None:  # noqa: D102
+        if ext is for_gpus:
+            self.spawn(
+                [*ext.extra_compile_args, *ext.sources, "-o", self.get_ext_fullpath(ext.name)]
+            )
+            return
         own = copy.copy(self)
         own.build_temp = str(Path(self.build_temp, ext.name))
         super(BuildVariants, own).build_extension(ext)
@@ -68,8 +75,26 @@ which_runs = Extension(
     extra_compile_args=["-O2", "-g0"],
     optional=True,
 )
+cuda_home = os.environ.get("CUDA_HOME")
+nvcc = shutil.which("nvcc", path=str(Path(cuda_home, "bin")) if cuda_home else None)
+for_gpus = Extension(
+    "maxent_jax.native._cuda",
+    [str(NATIVE / "knn.cu")],
+    depends=[str(NATIVE / "knn_thread.h")],
+    extra_compile_args=[
+        *(str(nvcc), "-O3", "-std=c++17", "-shared", "-Xcompiler", "-fPIC", "-w"),
+        # Code for Hopper, and for what comes after it what a driver compiles.
+        "-gencode=arch=compute_90,code=[sm_90,compute_90]",
+        *("-I", str(NATIVE), "-I", headers("jaxlib")),
+    ],
+    optional=True,
+)
 setup(
     cmdclass={"build_ext": BuildVariants, "bdist_wheel": AnyPython},
     options={"build_ext": {"parallel": True}},
-    ext_modules=[which_runs, *(extension(*variant) for variant in variants.items())],
+    ext_modules=[
+        which_runs,
+        *(extension(*variant) for variant in variants.items()),
+        *([for_gpus] if nvcc else []),
+    ],
 )

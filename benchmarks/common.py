@@ -73,10 +73,24 @@ def importable(peers: Iterable[Peer]) -> list[tuple[Peer, ModuleType]]:
         try:
             found.append((peer, importlib.import_module(peer.module)))
         except Exception as error:  # one that is installed but broken raises anything at all
-            absent.append(f"{peer.distribution} ({type(error).__name__}: {error})")
+            absent.append(f"{peer.distribution} ({sentence(error)})")
     if absent:
         print("not measured: " + "; ".join(absent), file=sys.stderr)
     return found
+
+
+def measured(peer: Peer, measure: Callable, *args: Any) -> Any:
+    """What the peer gives; None, and one line on standard error, where it fails."""
+    try:
+        return measure(*args)
+    except Exception as error:  # whatever a library raises costs its own row, never another's
+        print(f"not measured: {peer.distribution} ({sentence(error)})", file=sys.stderr)
+        return None
+
+
+def sentence(error: Exception) -> str:
+    """The class and first line of what was raised."""
+    return f"{type(error).__name__}: {error}".splitlines()[0]
 
 
 def compiled(function: Callable, *args: Any) -> tuple[Callable, float]:
@@ -97,13 +111,24 @@ def median_seconds(call: Callable[[], Any], repeats: int = REPEATS) -> float:
     return statistics.median(seconds)
 
 
-def progress(row: dict[str, Any]) -> dict[str, Any]:
-    """The row at four significant digits, shown on standard error as soon as it is measured."""
-    row = {k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in row.items()}
-    print(" ".join(f"{name}={value}" for name, value in row.items()), file=sys.stderr, flush=True)
-    return row
+def progress(row: dict[str, Any]) -> None:
+    """The row's values on standard error."""
+    print(
+        " ".join(f"{name}={value}" for name, value in rounded(row).items()),
+        file=sys.stderr,
+        flush=True,
+    )
 
 
 def emit(row: dict[str, Any]) -> None:
-    """One JSON line on standard output."""
-    print(json.dumps(row), flush=True)
+    """One JSON line on standard output as soon as it is measured; where that is no terminal, its
+    values on standard error too.
+    """
+    print(json.dumps(rounded(row)), flush=True)
+    if not sys.stdout.isatty():
+        progress(row)
+
+
+def rounded(row: dict[str, Any]) -> dict[str, Any]:
+    """Numbers to four significant digits."""
+    return {k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in row.items()}

@@ -47,16 +47,14 @@ def measure(env: str, name: str, repeats: int) -> Iterator[dict[str, Any]]:
                 first_step(env, name, Path(folder, f"{kind}-{i}"), cache)
                 for i, cache in enumerate(caches)
             ]
-            yield common.progress(
-                {
-                    "benchmark": "compile_time",
-                    "env": env,
-                    "preset": name,
-                    "cache": kind,
-                    "seconds_to_first_step": statistics.median(seconds),
-                    "runs": repeats,
-                }
-            )
+            yield {
+                "benchmark": "compile_time",
+                "env": env,
+                "preset": name,
+                "cache": kind,
+                "seconds_to_first_step": statistics.median(seconds),
+                "runs": repeats,
+            }
 
 
 def main() -> None:
@@ -66,7 +64,7 @@ def main() -> None:
     args = flags.parse_args()
     common.print_versions()
     toy = ("pendulum", "smoke", 1)
-    for row in list(measure(*(toy if args.toy else (args.env, args.preset, args.repeats)))):
+    for row in measure(*(toy if args.toy else (args.env, args.preset, args.repeats))):
         common.emit(row)
 
 

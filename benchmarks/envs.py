@@ -206,20 +206,18 @@ def measure(cases, peers, repeats: int) -> Iterator[dict[str, Any]]:
 
     def row(who: str, workload: Workload, found: Measurement, ceiling: Measurement, **more):
         num_steps, num_envs, _ = workload.actions.shape
-        return common.progress(
-            {
-                "benchmark": "envs",
-                "env": workload.env.task.name,
-                "who": who,
-                "envs": num_envs,
-                "steps_of_each": num_steps,
-                "env_steps_per_second": found.steps_per_second,
-                "over_bare_rollout": found.steps_per_second / ceiling.steps_per_second,
-                **more,
-                **fidelity(workload.env, found, ceiling),
-                **found.extra,
-            }
-        )
+        return {
+            "benchmark": "envs",
+            "env": workload.env.task.name,
+            "who": who,
+            "envs": num_envs,
+            "steps_of_each": num_steps,
+            "env_steps_per_second": found.steps_per_second,
+            "over_bare_rollout": found.steps_per_second / ceiling.steps_per_second,
+            **more,
+            **fidelity(workload.env, found, ceiling),
+            **found.extra,
+        }
 
     for name, backend, profile, num_envs, num_steps in cases:
         workload = make_workload(name, backend, profile, num_envs, num_steps)
@@ -228,8 +226,9 @@ def measure(cases, peers, repeats: int) -> Iterator[dict[str, Any]]:
             ceilings[size] = bare_rollout(workload, repeats)
             yield row("mujoco.rollout", workload, ceilings[size], ceilings[size])
             for peer, module in peers:
-                found = peer.measure(module, workload, repeats)
-                yield row(peer.distribution, workload, found, ceilings[size])
+                found = common.measured(peer, peer.measure, module, workload, repeats)
+                if found is not None:
+                    yield row(peer.distribution, workload, found, ceilings[size])
         settings = {"backend": backend, "physics": profile}
         found = ours(workload, repeats)
         yield row("maxent_jax", workload, found, ceilings[size], **settings)
@@ -262,8 +261,7 @@ def main() -> None:
         print("toy: without mjx, which compiles for tens of seconds", file=sys.stderr)
         cases = [("humanoid", "mujoco", "reference", 4, 4)]
         peers = [(peer, module) for peer, module in peers if peer.module == "gymnasium"]
-    rows = list(measure(cases, peers, args.repeats))
-    for row in rows:
+    for row in measure(cases, peers, args.repeats):
         common.emit(row)
 
 

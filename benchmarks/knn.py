@@ -5,6 +5,7 @@ as long. Queries and points are Gaussian or, with --run, states that the mixture
 Ours builds what it needs within each search; a peer's index is timed apart and in sum.
 """
 
+import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,6 +17,7 @@ import numpy as np
 from benchmarks import common
 from maxent_jax import analysis, native, runs
 from maxent_jax.density.knn import by_blocks, knn_distances
+from maxent_jax.density.knn import in_cuda as search_in_cuda
 
 NUM_NEIGHBORS, NUM_FEATURES = 3, 7  # k and p of the paper
 SIZES = ((64, 16_384), (4096, 65_536), (4096, 1_000_000))  # queries, points
@@ -86,9 +88,12 @@ def ours(queries: jax.Array, points: jax.Array) -> jax.Array:
 
 def in_xla(queries: jax.Array, points: jax.Array) -> jax.Array:
     """Ours where there is no compiler."""
-    exclude = jnp.full(len(queries), -1, jnp.int32)
-    labels = jnp.arange(len(points), dtype=jnp.int32)
-    return by_blocks(NUM_NEIGHBORS, queries, points, exclude, labels, jnp.int32(len(points)))
+    return by_blocks(NUM_NEIGHBORS, *_everyone(queries, points))
+
+
+def in_cuda(queries: jax.Array, points: jax.Array) -> jax.Array:
+    """Ours in CUDA, where nvcc has built it."""
+    return search_in_cuda(NUM_NEIGHBORS, *_everyone(queries, points))
 
 
 def top_k(queries: jax.Array, points: jax.Array) -> jax.Array:
@@ -97,6 +102,13 @@ def top_k(queries: jax.Array, points: jax.Array) -> jax.Array:
     squared = query_squares - 2 * queries @ points.T + jnp.sum(points**2, axis=1)[None, :]
     nearest, _ = jax.lax.top_k(-squared, NUM_NEIGHBORS)
     return jnp.sqrt(jnp.maximum(-nearest, 0))
+
+
+def _everyone(queries, points):
+    """The arguments of a form that excludes nobody."""
+    exclude = jnp.full(len(queries), -1, jnp.int32)
+    labels = jnp.arange(len(points), dtype=jnp.int32)
+    return queries, points, exclude, labels, jnp.int32(len(points))
 
 
 def alone(search: Search, problem: Problem, repeats: int) -> Measurement:
@@ -217,21 +229,19 @@ def measure(problem: Problem, peers, repeats: int) -> Iterator[dict[str, Any]]:
         if "build_seconds" in found.extra:
             total = found.seconds + found.extra["build_seconds"]
             with_build = {"ours_over_this_with_build": total / our_seconds[form]}
-        return common.progress(
-            {
-                "benchmark": "knn",
-                "data": problem.data,
-                "who": who,
-                "form": form,
-                "queries": problem.queries.shape[1],
-                "points": len(problem.points),
-                "gpair_per_second": problem.num_pairs / found.seconds / 1e9,
-                "ours_over_this": found.seconds / our_seconds[form],
-                **with_build,
-                "max_relative_error": float(np.max(error)),
-                **found.extra,
-            }
-        )
+        return {
+            "benchmark": "knn",
+            "data": problem.data,
+            "who": who,
+            "form": form,
+            "queries": problem.queries.shape[1],
+            "points": len(problem.points),
+            "gpair_per_second": problem.num_pairs / found.seconds / 1e9,
+            "ours_over_this": found.seconds / our_seconds[form],
+            **with_build,
+            "max_relative_error": float(np.max(error)),
+            **found.extra,
+        }
 
     searches = {"maxent_jax": ours}
     if native.library():
@@ -243,7 +253,9 @@ def measure(problem: Problem, peers, repeats: int) -> Iterator[dict[str, Any]]:
         yield row(who, "scan", in_scan(search, problem, repeats))
     yield row("maxent_jax", "vmap", vmapped(ours, problem, repeats))
     for peer, module in peers:
-        yield row(peer.distribution, "alone", peer.measure(module, problem, repeats))
+        found = common.measured(peer, peer.measure, module, problem, repeats)
+        if found is not None:
+            yield row(peer.distribution, "alone", found)
 
 
 def main() -> None:
@@ -262,10 +274,9 @@ def main() -> None:
     clouds = {"gaussian": gaussian(most)}
     if args.run is not None:
         clouds["run"] = visited(args.run, most)
-    problems = [make_problem(data, clouds[data], *size) for data in clouds for size in sizes]
-    rows = [row for problem in problems for row in measure(problem, peers, args.repeats)]
-    for row in rows:
-        common.emit(row)
+    for data, size in itertools.product(clouds, sizes):
+        for row in measure(make_problem(data, clouds[data], *size), peers, args.repeats):
+            common.emit(row)
 
 
 if __name__ == "__main__":

@@ -50,21 +50,21 @@ REGIMES: dict[str, dict[str, Any]] = {
     "rate 3e-4": {"learning_rate": 3e-4},
     "batch 256": {"batch_size": 256},
     "2 x 256": {"hidden_size": 256},
+    "twice the gradient steps, half the iterations": {
+        "updates_per_step": 0.25,
+        "num_iterations": 6,
+    },
     "32 envs, half the env steps": {
         "num_envs": 32,
-        "updates_per_step": 0.5,
+        "updates_per_step": 0.25,
         "steps_per_iteration": 60_000,
         "replay_size": 120_000,
     },
     "128 envs, twice the env steps": {
         "num_envs": 128,
-        "updates_per_step": 0.125,
+        "updates_per_step": 0.0625,
         "steps_per_iteration": 240_000,
         "replay_size": 480_000,
-    },
-    "half the iteration, twice as many": {
-        "steps_per_iteration": 60_480,
-        "num_iterations": 12,
     },
     "episodes of 500": {"episode_length": 500},
     "discount 0.98": {"discount": 0.98, "shaping": 50.0, "reward_scale": 16.0},
@@ -184,12 +184,6 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def summary(row: dict[str, Any]) -> dict[str, Any]:
-    """The row's last iteration, on one line."""
-    last = {name: values[-1] for name, values in row.items() if isinstance(values, list)}
-    return {"regime": row["regime"], "seed": row["seed"]} | last
-
-
 def main() -> None:
     flags = common.parser(__doc__)
     flags.add_argument("--regimes", nargs="*", choices=list(REGIMES), default=list(REGIMES))
@@ -208,14 +202,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "toy.json" if args.toy else args.out
         out.parent.mkdir(parents=True, exist_ok=True)
-        rows = []
         for row in study(args.regimes, args.seeds, base, args.jobs, out):
-            common.progress(summary(row))
-            rows.append(row)
+            common.emit(row)
         every = json.loads(out.read_text(encoding="utf-8"))["rows"]
         draw(every, out.with_suffix(".png"))
-    for row in rows:
-        common.emit(row)
 
 
 if __name__ == "__main__":

@@ -147,25 +147,25 @@ def measure(name: str, num_envs: int, num_steps: int) -> Iterator[dict[str, Any]
     truth_env = MujocoEnv(task, "mujoco")
     starts, actions = settled(truth_env, num_envs, num_steps, SEED)
     truth = motion(truth_env, starts, actions)
-    yield common.progress(
-        {"benchmark": "physics", "env": name, "options": "C, unchanged"}
-        | {"env_steps_per_second": truth["rate"]}
-        | fidelity(truth_env, truth, truth)
-    )
+    yield {
+        "benchmark": "physics",
+        "env": name,
+        "options": "C, unchanged",
+        "env_steps_per_second": truth["rate"],
+        **fidelity(truth_env, truth, truth),
+    }
     for label, options in OPTIONS[name].items():
         env = MujocoEnv(task, "mjx", options)
         found = motion(env, starts, actions)
-        yield common.progress(
-            {
-                "benchmark": "physics",
-                "env": name,
-                "options": label,
-                "envs": num_envs,
-                "env_steps_per_second": found["rate"],
-                "compile_seconds": found["compile_seconds"],
-                **fidelity(env, found, truth),
-            }
-        )
+        yield {
+            "benchmark": "physics",
+            "env": name,
+            "options": label,
+            "envs": num_envs,
+            "env_steps_per_second": found["rate"],
+            "compile_seconds": found["compile_seconds"],
+            **fidelity(env, found, truth),
+        }
 
 
 def survive(name: str, num_steps: int, num_envs: int) -> dict[str, Any]:
@@ -188,17 +188,15 @@ def survive(name: str, num_steps: int, num_envs: int) -> dict[str, Any]:
     for key in jax.random.split(key_steps, num_chunks):
         carry = scan_steps(carry, jax.random.split(key, CHUNK))
     invalid, leaked, ended = carry[1].tolist()
-    return common.progress(
-        {
-            "benchmark": "physics",
-            "env": name,
-            "options": "fast",
-            "random_steps": num_chunks * num_envs * CHUNK,
-            "not_finite_resets": invalid,
-            "vector_steps_with_nan_observed": leaked,
-            "episodes_ended": ended,
-        }
-    )
+    return {
+        "benchmark": "physics",
+        "env": name,
+        "options": "fast",
+        "random_steps": num_chunks * num_envs * CHUNK,
+        "not_finite_resets": invalid,
+        "vector_steps_with_nan_observed": leaked,
+        "episodes_ended": ended,
+    }
 
 
 def learn(name: str, label: str, seed: int) -> dict[str, Any]:
@@ -213,17 +211,15 @@ def learn(name: str, label: str, seed: int) -> dict[str, Any]:
     for _ in range(config.num_segments):
         state, _ = programs.train_segment(state)
     _, metrics = programs.end(state)
-    return common.progress(
-        {
-            "benchmark": "physics",
-            "env": name,
-            "options": label,
-            "seed": seed,
-            "cells": int(metrics["cumulative_coverage"]),
-            "mixture_cells": int(metrics["mixture_coverage"]),
-            "seconds": time.perf_counter() - started,
-        }
-    )
+    return {
+        "benchmark": "physics",
+        "env": name,
+        "options": label,
+        "seed": seed,
+        "cells": int(metrics["cumulative_coverage"]),
+        "mixture_cells": int(metrics["mixture_coverage"]),
+        "seconds": time.perf_counter() - started,
+    }
 
 
 def main() -> None:
@@ -242,12 +238,12 @@ def main() -> None:
         if args.toy:
             OPTIONS[name] = {}
         if args.survive:
-            rows = [survive(name, args.survive, args.envs)]
+            rows = iter([survive(name, args.survive, args.envs)])
         elif args.learner:
-            rows = [learn(name, label, seed) for seed in args.learner for label in OPTIONS[name]]
+            rows = (learn(name, label, seed) for seed in args.learner for label in OPTIONS[name])
         else:
             size = (2, 4) if args.toy else (args.envs, NUM_STEPS)
-            rows = list(measure(name, *size))
+            rows = measure(name, *size)
         for row in rows:
             common.emit(row)
 

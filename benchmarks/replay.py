@@ -99,28 +99,26 @@ def measure(env: str, capacity: int, repeats: int) -> Iterator[dict[str, Any]]:
         assert replay.capacity_of(ring) == capacity
         size = num_bytes(ring)
         empty, full = (insert_seconds(config, full, repeats) for full in (False, True))
-        yield common.progress(
-            {
-                "benchmark": "replay",
-                "env": env,
-                "states": dtype,
-                "transitions": capacity,
-                "gigabytes": size / 1e9,
-                "over_both_observations": size / both_observations(config),
-                "insert_microseconds": 1e6 * full,
-                "insert_full_over_empty": full / empty,
-                "sample_microseconds": 1e6 * sample_seconds(config, repeats),
-            }
-        )
+        yield {
+            "benchmark": "replay",
+            "env": env,
+            "states": dtype,
+            "transitions": capacity,
+            "gigabytes": size / 1e9,
+            "over_both_observations": size / both_observations(config),
+            "insert_microseconds": 1e6 * full,
+            "insert_full_over_empty": full / empty,
+            "sample_microseconds": 1e6 * sample_seconds(config, repeats),
+        }
 
 
 def main() -> None:
     args = common.parser(__doc__).parse_args()
     common.print_versions()
     envs, capacity = (("ant",), 1_000) if args.toy else (MUJOCO_ENVS, CAPACITY)
-    rows = [row for env in envs for row in measure(env, capacity, args.repeats)]
-    for row in rows:
-        common.emit(row)
+    for env in envs:
+        for row in measure(env, capacity, args.repeats):
+            common.emit(row)
 
 
 if __name__ == "__main__":

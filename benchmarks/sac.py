@@ -8,7 +8,7 @@ ours is a segment of MaxEnt-V with the reward measured and paid, theirs is `lear
 import functools
 import itertools
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -61,10 +61,10 @@ def update_flops(hidden_size: int, batch_size: int) -> float:
     return float(batch_size * (target + critic_step + actor_step))
 
 
-def ours(
-    hidden_size: int, batch_size: int, layer_norm: bool, num_seeds: int, num_updates: int, repeats
-) -> tuple[float, float]:
-    """Updates a second, all seeds together, and seconds to compile."""
+def many_updates(
+    hidden_size: int, batch_size: int, layer_norm: bool, num_seeds: int, num_updates: int
+) -> tuple[Callable, tuple[Any, Any]]:
+    """A function that makes that many updates of each seed, and what it takes."""
     config = preset(
         "paper",
         hidden_layers=NUM_HIDDEN_LAYERS,
@@ -93,11 +93,17 @@ def ours(
         return jax.lax.scan(update, learner, inputs)[0]
 
     if num_seeds == 1:  # no axis of seeds, as in training
-        learners, inputs = jax.tree.map(lambda x: x[0], (learners, inputs))
-        program, compile_seconds = common.compiled(run, learners, inputs)
-    else:
-        program, compile_seconds = common.compiled(jax.vmap(run), learners, inputs)
-    seconds = common.median_seconds(lambda: program(learners, inputs), repeats)
+        return run, jax.tree.map(lambda x: x[0], (learners, inputs))
+    return jax.vmap(run), (learners, inputs)
+
+
+def ours(
+    hidden_size: int, batch_size: int, layer_norm: bool, num_seeds: int, num_updates: int, repeats
+) -> tuple[float, float]:
+    """Updates a second, all seeds together, and seconds to compile."""
+    run, inputs = many_updates(hidden_size, batch_size, layer_norm, num_seeds, num_updates)
+    program, compile_seconds = common.compiled(run, *inputs)
+    seconds = common.median_seconds(lambda: program(*inputs), repeats)
     return num_seeds * num_updates / seconds, compile_seconds
 
 
@@ -207,19 +213,17 @@ def measure(
 
     def row(who: str, updates: float, **more):
         rates.append(updates)
-        return common.progress(
-            {
-                "benchmark": "sac",
-                "who": who,
-                "hidden_size": hidden_size,
-                "batch_size": batch_size,
-                "updates_per_second": updates,
-                "samples_per_second": updates * batch_size,
-                "share_of_matmul_peak": updates * update_flops(hidden_size, batch_size) / peak,
-                "ours_over_this": rates[0] / updates,
-                **more,
-            }
-        )
+        return {
+            "benchmark": "sac",
+            "who": who,
+            "hidden_size": hidden_size,
+            "batch_size": batch_size,
+            "updates_per_second": updates,
+            "samples_per_second": updates * batch_size,
+            "share_of_matmul_peak": updates * update_flops(hidden_size, batch_size) / peak,
+            "ours_over_this": rates[0] / updates,
+            **more,
+        }
 
     for layer_norm, num_seeds in itertools.product((False, True), NUM_SEEDS):
         updates, compile_seconds = ours(
@@ -228,8 +232,10 @@ def measure(
         more = {"layer_norm": layer_norm, "seeds": num_seeds, "compile_seconds": compile_seconds}
         yield row("maxent_jax", updates, **more)
     for peer, module in peers:
-        updates = peer.measure(module, hidden_size, batch_size, num_updates, repeats)
-        yield row(peer.distribution, updates, layer_norm=False, seeds=1)
+        args = module, hidden_size, batch_size, num_updates, repeats
+        updates = common.measured(peer, peer.measure, *args)
+        if updates is not None:
+            yield row(peer.distribution, updates, layer_norm=False, seeds=1)
 
 
 def measure_loops(
@@ -238,23 +244,25 @@ def measure_loops(
     """Rows for one size; ratios are to ours in the same loop."""
     hidden_size, batch_size = size
     for loop in loops:
-        found = {"maxent_jax": our_loop(hidden_size, batch_size, loop, steps, repeats)}
-        found |= {
-            peer.distribution: their_loop(module, hidden_size, batch_size, loop, steps, repeats)
-            for peer, module in peers
-        }
-        for who, rate in found.items():
-            yield common.progress(
-                {
-                    "benchmark": "sac",
-                    "who": f"{who}, whole loop",
-                    "hidden_size": hidden_size,
-                    "batch_size": batch_size,
-                    **loop._asdict(),
-                    "env_steps_per_second": rate,
-                    "ours_over_this": found["maxent_jax"] / rate,
-                }
-            )
+        sizes = hidden_size, batch_size, loop, steps, repeats
+        ours_here = our_loop(*sizes)
+
+        def row(who: str, rate: float, loop=loop, ours_here=ours_here):
+            return {
+                "benchmark": "sac",
+                "who": f"{who}, whole loop",
+                "hidden_size": hidden_size,
+                "batch_size": batch_size,
+                **loop._asdict(),
+                "env_steps_per_second": rate,
+                "ours_over_this": ours_here / rate,
+            }
+
+        yield row("maxent_jax", ours_here)
+        for peer, module in peers:
+            rate = common.measured(peer, their_loop, module, *sizes)
+            if rate is not None:
+                yield row(peer.distribution, rate)
 
 
 def main() -> None:
@@ -264,13 +272,13 @@ def main() -> None:
     sizes, num_updates = (((16, 8),), 4) if args.toy else (SIZES, NUM_UPDATES)
     loops, steps = ((Loop(4, 0.25),), 8) if args.toy else (LOOPS, LOOP_STEPS)
     peak = peak_flops(256 if args.toy else PEAK_SIZE, args.repeats)
-    rows = [common.progress({"benchmark": "sac", "who": "matmul", "gflop_per_second": peak / 1e9})]
+    common.emit({"benchmark": "sac", "who": "matmul", "gflop_per_second": peak / 1e9})
     peers = common.importable(PEERS)
     for size in sizes:
-        rows += measure(size, num_updates, peak, peers, args.repeats)
-        rows += measure_loops(size, loops, steps, peers, args.repeats)
-    for row in rows:
-        common.emit(row)
+        for row in measure(size, num_updates, peak, peers, args.repeats):
+            common.emit(row)
+        for row in measure_loops(size, loops, steps, peers, args.repeats):
+            common.emit(row)
 
 
 if __name__ == "__main__":

@@ -35,19 +35,17 @@ def measure(name: str, settings: dict[str, Any], counts, repeats: int) -> Iterat
         steps = count * config.num_envs * config.vector_steps
         rate = steps / seconds_per_segment(config, repeats)
         first = first or rate
-        yield common.progress(
-            {
-                "benchmark": "seeds",
-                "env": config.env,
-                "preset": name,
-                "seeds": count,
-                "envs_of_each": config.num_envs,
-                "batch_size": config.batch_size,
-                "updates_per_step": config.updates_per_step,
-                "env_steps_per_second": rate,
-                "over_one_by_one": rate / first,
-            }
-        )
+        yield {
+            "benchmark": "seeds",
+            "env": config.env,
+            "preset": name,
+            "seeds": count,
+            "envs_of_each": config.num_envs,
+            "batch_size": config.batch_size,
+            "updates_per_step": config.updates_per_step,
+            "env_steps_per_second": rate,
+            "over_one_by_one": rate / first,
+        }
 
 
 def main() -> None:
@@ -68,7 +66,7 @@ def main() -> None:
         sizes = {"num_envs": args.num_envs, "batch_size": args.batch_size}
         settings |= {name: size for name, size in sizes.items() if size is not None}
         rows = measure(args.preset, settings, args.seeds, args.repeats)
-    for row in list(rows):
+    for row in rows:
         common.emit(row)
 
 

@@ -12,7 +12,8 @@ one program.
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -224,6 +225,18 @@ def programs(config: Config) -> Programs:
 @functools.lru_cache(maxsize=8)
 def _programs(config: Config, seed_axis: bool) -> Programs:
     return Programs(*(jax.jit(f, donate_argnums=0) for f in functions(config, seed_axis)))
+
+
+@functools.lru_cache(maxsize=8)
+def compiled(config: Config, jitted: Programs) -> Programs:
+    """The three compiled for the config's state, at the same time."""
+    state = jax.eval_shape(functools.partial(start, config))
+
+    def compile_one(function: Any) -> Callable:
+        return function.lower(state).compile()
+
+    with ThreadPoolExecutor(len(jitted)) as pool:
+        return Programs(*pool.map(compile_one, jitted))
 
 
 def functions(config: Config, seed_axis: bool) -> Programs:

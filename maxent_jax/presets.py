@@ -45,6 +45,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         **_FAST_LEARNER,
         reference_size=131_072,
         mixture_episodes=256,
+        random_baseline=False,
     ),
     "paper": dict(
         num_iterations=20,
@@ -93,10 +94,12 @@ _LONG: dict[str, Any] = dict(
     snapshots=3,
     mixture_episodes=64,
 )
-# An iteration has 120,000 gradient steps on Walker2d, 240,000 on Humanoid: enough to learn to walk.
+# An iteration has 15,000 gradient steps on Ant, 120,000 on Walker2d, 240,000 on Humanoid: enough to
+# learn to walk.
 _BUDGETS = {
+    "ant": dict(num_iterations=12, updates_per_step=0.125, random_baseline=False),
     "walker2d": dict(num_iterations=3, updates_per_step=0.125, **_LONG),
-    # A random policy's steps cost as much as the agent's: a quarter of the time here.
+    # A random policy's steps cost as much as the agent's: here a quarter of the time.
     "humanoid": dict(num_iterations=4, updates_per_step=0.25, random_baseline=False, **_LONG),
 }
 

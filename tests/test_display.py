@@ -14,7 +14,7 @@ def shown(monkeypatch, capsys, row, **environment):
     """The lines that two segments and an iteration's end leave on standard error."""
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    with Bar(preset("quick"), 4, 0, row) as bar:
+    with Bar(preset("quick", num_iterations=6, updates_per_step=0.25), 4, 0, row) as bar:
         bar.segment_done()
         bar.segment_done()
         bar.iteration_done(ROW)

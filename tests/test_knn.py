@@ -1,7 +1,11 @@
 """Exact neighbours against brute force in float64, from the same float32 inputs."""
 
+import ctypes
 import functools
 import itertools
+import shutil
+import subprocess
+from pathlib import Path
 
 import hypothesis
 import jax
@@ -13,6 +17,8 @@ from scipy.spatial import cKDTree
 
 from maxent_jax import native
 from maxent_jax.density.knn import (
+    CUDA_FEATURES,
+    CUDA_NEIGHBORS,
     FEW_QUERIES,
     LARGE_BLOCK,
     TREE_POINTS,
@@ -34,17 +40,47 @@ if native.library():
     FORMS["every point"] = functools.partial(in_cpp, tree=False)
     FORMS["tree"] = functools.partial(in_cpp, tree=True)
 JITTED = {name: jax.jit(form, static_argnums=0) for name, form in FORMS.items()}
+# What the threads of a GPU do, on a CPU; the points among so many blocks.
+THREADS = {"threads": 1, "threads, points in parts": 3} if shutil.which("c++") else {}
 
 
-@pytest.fixture(params=FORMS)
+@pytest.fixture(scope="session")
+def on_host(tmp_path_factory):
+    """knn_on_host.cc, compiled."""
+    library = tmp_path_factory.mktemp("threads") / "knn_on_host.so"
+    source = Path(__file__).parent / "knn_on_host.cc"
+    headers = Path(native.__file__).parent
+    flags = ("-std=c++17", "-O2", "-shared", "-fPIC", "-Wno-unknown-pragmas")
+    subprocess.run(["c++", *flags, "-I", headers, source, "-o", library], check=True)
+    return ctypes.CDLL(str(library)).knn_on_host
+
+
+def by_threads(on_host, parts, k, queries, points, exclude, labels, count):
+    """As in_cuda, which leaves to by_reduction what its registers do not hold."""
+    if k > CUDA_NEIGHBORS or queries.shape[1] > CUDA_FEATURES:
+        return JITTED["reduction"](k, queries, points, exclude, labels, count)
+    arrays = [np.ascontiguousarray(x, np.float32) for x in (queries, points)]
+    arrays += [np.ascontiguousarray(x, np.int32) for x in (labels, exclude)]
+    sizes = [int(count), *np.shape(queries), k, parts]
+    found = np.empty((len(queries), k), np.float32)
+    pointers = [ctypes.c_void_p(x.ctypes.data) for x in (*arrays, found)]
+    on_host(*pointers[:-1], *map(ctypes.c_int32, sizes), pointers[-1])
+    return found
+
+
+@pytest.fixture(params=[*FORMS, *THREADS])
 def search(request):
     """Each form of the search, with the arguments of knn_distances."""
+    form = JITTED.get(request.param)
+    if form is None:
+        host = request.getfixturevalue("on_host")
+        form = functools.partial(by_threads, host, THREADS[request.param])
 
     def find(queries, points, k, exclude=None, count=None, labels=None):
         exclude = np.full(len(queries), -1, np.int32) if exclude is None else exclude
         labels = np.arange(len(points), dtype=np.int32) if labels is None else labels
         count = np.int32(len(points) if count is None else count)
-        return JITTED[request.param](k, queries, points, exclude, labels, count)
+        return form(k, queries, points, exclude, labels, count)
 
     return find
 

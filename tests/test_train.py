@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import time
 from pathlib import Path
 
@@ -14,17 +15,24 @@ import pytest
 from commands import ROOT, call, in_subprocess
 
 import maxent_jax
+from benchmarks import common, gpu
 from maxent_jax import envs, integrity, runs
 from maxent_jax.commands import train
 from maxent_jax.config import preset
 from maxent_jax.runs import driver
 
+NO_RENDERING = Path(__file__).parent / "no_rendering"
 TINY = ("--preset", "smoke", "--num-segments", "1", "--mixture-episodes", "6")
 
 
 def benchmark(name, *arguments):
+    """What it prints at toy size where no library can render."""
     line = [sys.executable, "-m", f"benchmarks.{name}", "--toy", *map(str, arguments)]
-    return subprocess.run(line, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    path = os.pathsep.join(filter(None, (str(NO_RENDERING), os.environ.get("PYTHONPATH"))))
+    environment = os.environ | {"PYTHONPATH": path}
+    return subprocess.run(
+        line, cwd=ROOT, check=True, capture_output=True, text=True, env=environment
+    ).stdout
 
 
 @pytest.fixture
@@ -294,18 +302,42 @@ def test_a_benchmark_ends_with_json_rows(module):
     assert json.loads(printed[-1])["benchmark"] == module
 
 
+def test_a_peer_that_fails_costs_its_own_row(capsys):
+    def fails():
+        raise OSError("no such thing\non a second line")
+
+    broken = common.Peer("absent", "no_such_module", fails)
+    assert common.importable([broken]) == []
+    assert common.measured(broken, fails) is None
+    said = capsys.readouterr().err.splitlines()
+    assert said[0].startswith("not measured: absent (ModuleNotFoundError: ")
+    assert said[1] == "not measured: absent (OSError: no such thing)"
+
+
+def rows_of(part, out):
+    return [json.loads(line) for line in (out / f"{part}.jsonl").read_text().splitlines()]
+
+
 @pytest.mark.slow
-def test_a_gpu_session_runs_part_by_part_and_only_once(tmp_path):
-    folders = ("--out", tmp_path / "results", "--work", tmp_path / "work")
-    parts = ("--part", "envs", "train")  # the others are benchmarks that run above
-    first = benchmark("gpu_session", *parts, *folders)
-    assert first.count("exit 0") == 4
-    ran = json.loads((tmp_path / "results" / "envs_ant.json").read_text())
-    assert ran["rows"][-1]["benchmark"] == "envs"
-    paths = np.load(tmp_path / "results" / "ant_states.npz")
-    assert paths["seed_1_states"].shape[:1] == paths["seed_1_policy"].shape == (3,)
-    assert (tmp_path / "results" / "ant_curves.png").stat().st_size > 0
-    assert benchmark("gpu_session", *parts, *folders) == ""
+def test_what_a_gpu_is_asked_runs_on_a_cpu(tmp_path):
+    for part, asked in gpu.PARTS.items():
+        printed = benchmark("gpu", "--part", part, "--out", tmp_path).splitlines()
+        found = [row["section"] for row in rows_of(part, tmp_path)]
+        assert "failed" not in found and len(set(found)) >= len(asked)
+        assert "programs compiled" in printed[0] and len(printed) <= 10
+    assert len(list(tmp_path.iterdir())) <= 6
+    played = rows_of("first", tmp_path)[-1]
+    assert played["section"] == "played" and len(played["ends"]) == 3
+    with tarfile.open(tmp_path / "first.tar.gz") as packed:
+        names = packed.getnames()
+    assert "ant/metrics.jsonl" in names and "ant/figures/fireworks.png" in names
+
+
+@pytest.mark.slow
+def test_a_part_whose_time_is_up_keeps_its_rows(tmp_path):
+    printed = benchmark("gpu", "--part", "first", "--seconds", "20", "--out", tmp_path)
+    assert "programs compiled" in printed
+    assert rows_of("first", tmp_path)[0]["section"] == "device"
 
 
 @pytest.mark.slow

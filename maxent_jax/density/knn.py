@@ -1,8 +1,8 @@
 """Exact distances to the k nearest points, on the device, without a distance matrix in memory.
 
 Distances are direct float32 differences: the expanded square loses the small ones, which matter
-most. One question, three answers that differ in speed alone: compiled C++ on a CPU, and two forms
-in XLA, by blocks of points for CPUs and by one reduction for GPUs.
+most. One question, four answers that differ in speed alone: compiled C++ on a CPU, two forms in
+XLA, by blocks of points for CPUs and by one reduction for GPUs, and CUDA.
 """
 
 import functools
@@ -24,6 +24,8 @@ FEW_QUERIES, SMALL_BLOCK, LARGE_BLOCK = 2048, 8, 32
 # 131,072 points; with 10 features 2.2 times there, with 16 no longer (0.4). With a run's states
 # twice to seven times as fast from this size on.
 TREE_QUERIES, TREE_POINTS, TREE_FEATURES = 2048, 8192, 10
+# What the registers of a GPU's thread hold; more goes by one reduction.
+CUDA_NEIGHBORS, CUDA_FEATURES = 8, 15
 
 
 def knn_distances(
@@ -102,6 +104,27 @@ def in_cpp(
         vmap_method="expand_dims",  # what is not mapped over is not copied
     )
     return call(queries, points, labels, exclude, count, tree=tree)
+
+
+def in_cuda(
+    k: int,
+    queries: jax.Array,
+    points: jax.Array,
+    exclude: jax.Array,
+    labels: jax.Array,
+    count: jax.Array,
+) -> jax.Array:
+    """As knn_distances, in float32, on an NVIDIA GPU with native.cuda(). Not what knn_distances
+    takes there: it has not been measured on a GPU yet.
+    """
+    if k > CUDA_NEIGHBORS or queries.shape[1] > CUDA_FEATURES:
+        return by_reduction(k, queries, points, exclude, labels, count)
+    call = jax.ffi.ffi_call(
+        native.CUDA_TARGET,
+        jax.ShapeDtypeStruct((queries.shape[0], k), jnp.float32),
+        vmap_method="expand_dims",
+    )
+    return call(queries, points, labels, exclude, count)
 
 
 def by_blocks(

@@ -2,7 +2,7 @@
 
 An optional fast path: results are the same without it. The library is built once for each kind of
 processor. Nothing of a build runs where it cannot: a small library for the oldest processors
-(cpu.c) says which one to load.
+(cpu.c) says which one to load. Where nvcc is, the search is built for NVIDIA's GPUs too (knn.cu).
 """
 
 import ctypes
@@ -16,6 +16,7 @@ import jax
 from maxent_jax.choices import ConfigError
 
 TARGETS = ("maxent_knn", "maxent_physics")
+CUDA_TARGET = "maxent_knn_cuda"
 # Builds, the fastest first, and the processors that run each, as maxent_level numbers them.
 LEVELS = {"v4": (4,), "v3": (3, 4), "v8": (8,)}
 NONE, AUTO = "none", "auto"
@@ -39,6 +40,17 @@ def library() -> ctypes.CDLL | None:
     for target in TARGETS:
         function = jax.ffi.pycapsule(getattr(loaded, target))
         jax.ffi.register_ffi_target(target, function, platform="cpu")
+    return loaded
+
+
+@functools.cache
+def cuda() -> ctypes.CDLL | None:
+    """The build for NVIDIA's GPUs, its function known to XLA; None where there is none."""
+    if not path("cuda").exists():
+        return None
+    loaded = ctypes.CDLL(str(path("cuda")))
+    function = jax.ffi.pycapsule(getattr(loaded, CUDA_TARGET))
+    jax.ffi.register_ffi_target(CUDA_TARGET, function, platform="CUDA")
     return loaded
 
 

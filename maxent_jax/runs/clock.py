@@ -4,7 +4,6 @@ import time
 from typing import Any
 
 import jax
-import numpy as np
 
 
 class Clock:
@@ -15,6 +14,7 @@ class Clock:
         self._process_started = process_started
         self._origin = process_started - seconds.get("wall_seconds", 0.0)
         self._first_step: float | None = seconds.get("wall_first_step")
+        self._compile = seconds.get("wall_compile", 0.0)
         self._train_total = seconds.get("wall_train_total", 0.0)
         self._parts: dict[str, float] = dict(seconds.get("parts", {}))
 
@@ -29,7 +29,11 @@ class Clock:
             if self._first_step is None:
                 self._first_step = time.perf_counter() - self._process_started
         state, metrics = result
-        return state, jax.tree.map(np.asarray, metrics)
+        return state, jax.device_get(metrics)
+
+    def compiled(self, started: float) -> None:
+        """Counts the time since then as spent on compilation."""
+        self._compile += time.perf_counter() - started
 
     def saved(self, started: float) -> None:
         """Counts the time since then as spent on a checkpoint."""
@@ -48,6 +52,7 @@ class Clock:
     def _totals(self) -> dict[str, float | None]:
         return {
             "wall_seconds": time.perf_counter() - self._origin,
+            "wall_compile": self._compile,  # of all processes that carried the run
             "wall_first_step": self._first_step,  # to the end of the first segment
             "wall_train_total": self._train_total,
         }

@@ -177,6 +177,9 @@ def _train(
     sinks = options.sinks if hosts.is_first() else Sinks()
     saved_at = time.perf_counter()
     with Interruption() as interruption, sinks.open(directory, config, done) as pass_on, bar:
+        compiling_since = time.perf_counter()
+        programs = algorithm.compiled(config, programs)
+        clock.compiled(compiling_since)
         while done < config.num_iterations:
             state, progress = advance(config, programs, state, progress, clock, bar)
             check_finite(directory, state, progress)

@@ -83,7 +83,7 @@ def check_finite(directory: Path, state: State, progress: Progress) -> None:
     Raises:
       NonFiniteError: a number of the state is not finite.
     """
-    leaves = jax.tree_util.tree_flatten_with_path(_finite(state))[0]
+    leaves = jax.tree_util.tree_flatten_with_path(jax.device_get(_finite(state)))[0]
     wrong = [path for path, is_finite in leaves if not is_finite]
     if wrong:
         where = jax.tree_util.keystr(wrong[0], simple=True, separator=".")

@@ -75,8 +75,8 @@ THREE: dict[str, Changes] = {
     "LA": {"method": "la"},
     "V": {"method": "v"},
 }
-# Ablations of what an iteration does, not of what the iterations add up to, end after two of them.
-ABLATION = ROBOT | {"cpu": Scale("quick", {"ant": 3}, {"num_iterations": 2})}
+# Ablations of what an iteration does, not of what the iterations add up to, end after four of them.
+ABLATION = ROBOT | {"cpu": Scale("quick", {"ant": 3}, {"num_iterations": 4})}
 # A method's own choice is left to the method: see `home`.
 REFRESHED: dict[str, Changes] = {
     "every 1": {"method": "la"},
@@ -92,7 +92,7 @@ STUDIES: dict[str, Study] = {
         THREE,
         {
             "toy": TOY,
-            "cpu": Scale("quick", {"ant": 3, "walker2d": 5, "humanoid": 3}),
+            "cpu": Scale("quick", {"ant": 5, "walker2d": 5, "humanoid": 3}),
             "paper": Scale("paper", dict.fromkeys(MUJOCO_ENVS, 5)),
         },
     ),
