@@ -493,7 +493,7 @@ def measure(part: str, seconds: float, toy: bool, rows: Path, work: Path) -> Non
     os.environ["XLA_PYTHON_CLIENT_MEM_FRACTION"] = "0.45"
     runtime.prepare(simulates_in_jax=True)
     began = time.monotonic()
-    with ThreadPoolExecutor(max_workers=8) as compilers, rows.open("a", encoding="utf-8") as file:
+    with ThreadPoolExecutor(max_workers=16) as compilers, rows.open("a", encoding="utf-8") as file:
         session = Session(toy, began + seconds, work, compilers, [])
 
         def write(row: Row) -> None:
@@ -505,14 +505,10 @@ def measure(part: str, seconds: float, toy: bool, rows: Path, work: Path) -> Non
             traceback.print_exception(error)
             write({"section": "failed", "what": what, "why": common.sentence(error)})
 
-        begun = []
-        for name, section in PARTS[part].items():
+        begun = {name: compilers.submit(s, session) for name, s in PARTS[part].items()}
+        for name, section in begun.items():
             try:
-                begun.append((name, section(session)))
-            except Exception as error:
-                failed(name, error)
-        for name, measure_section in begun:
-            try:
+                measure_section = section.result()
                 for row in measure_section():
                     write(row)
             except Exception as error:
