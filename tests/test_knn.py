@@ -21,6 +21,7 @@ from maxent_jax.density.knn import (
     CUDA_NEIGHBORS,
     FEW_QUERIES,
     LARGE_BLOCK,
+    QUERIES_AT_ONCE,
     TREE_POINTS,
     TREE_QUERIES,
     by_blocks,
@@ -184,6 +185,16 @@ def test_a_query_left_with_fewer_than_k_points_gets_inf_for_the_missing(search):
     points = np.array([[0.0], [1.0], [3.0]], np.float32)
     found = search(points, points, 3, np.array([0, 1, -1], np.int32))
     np.testing.assert_array_equal(found, [[1, 3, np.inf], [1, 2, np.inf], [0, 2, 3]])
+
+
+def test_a_reduction_takes_many_queries_in_groups():
+    rng = np.random.default_rng(0)
+    points = gaussian(rng, 5).astype(np.float32)
+    queries = gaussian(rng, 2 * QUERIES_AT_ONCE + 1).astype(np.float32)
+    exclude = np.arange(len(queries), dtype=np.int32) % 6 - 1
+    labels, count = np.arange(5, dtype=np.int32), np.int32(5)
+    found = JITTED["reduction"](3, queries, points, exclude, labels, count)
+    assert_close(found, brute_force(queries, points, 3, exclude))
 
 
 @pytest.mark.parametrize("num_queries", [50, FEW_QUERIES + 1])

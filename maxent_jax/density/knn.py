@@ -24,6 +24,9 @@ FEW_QUERIES, SMALL_BLOCK, LARGE_BLOCK = 2048, 8, 32
 # 131,072 points; with 10 features 2.2 times there, with 16 no longer (0.4). With a run's states
 # twice to seven times as fast from this size on.
 TREE_QUERIES, TREE_POINTS, TREE_FEATURES = 2048, 8192, 10
+# By one reduction. XLA parts the points of each query into about the root of their number, and
+# stores the k smallest of each part: 0.3 GB for these and 131,072 points.
+QUERIES_AT_ONCE = 65_536
 # What the registers of a GPU's thread hold; more goes by one reduction.
 CUDA_NEIGHBORS, CUDA_FEATURES = 8, 15
 
@@ -177,6 +180,17 @@ def by_reduction(
     """As knn_distances. One reduction over the points that carries the k smallest, with the
     distances fused into it: a few large kernels, and no loop over blocks that a GPU would wait for.
     """
+    num_queries = queries.shape[0]
+    if num_queries > QUERIES_AT_ONCE:
+        groups = -(-num_queries // QUERIES_AT_ONCE)  # rounded up, as is what each holds
+        padding = -num_queries % groups
+        queries = jnp.pad(queries, ((0, padding), (0, 0))).reshape(groups, -1, queries.shape[1])
+        exclude = jnp.pad(exclude, (0, padding)).reshape(groups, -1)
+        found = jax.lax.map(
+            lambda group: by_reduction(k, group[0], points, group[1], labels, count),
+            (queries, exclude),
+        )
+        return found.reshape(-1, k)[:num_queries]
     points = jnp.where(_neighbors(points, count)[:, None], points, jnp.inf)
     # [B, M], never stored. Reduced along M: along B, XLA stores it (seen in what it compiles to).
     differences = [queries[:, f, None] - points[None, :, f] for f in range(queries.shape[1])]
