@@ -129,7 +129,7 @@ def device(session: Session) -> Measure:
 
 
 def neighbors(session: Session) -> Measure:
-    """Ours beside the expanded square with top_k and, where it is installed, torch's cdist."""
+    """Ours, in XLA and where it was built in CUDA, beside the expanded square with top_k."""
 
     def scan(search, queries, points):
         step = lambda carry, queries: (carry, search(queries, points))
@@ -217,7 +217,6 @@ def peers(session: Session) -> Measure:
 
 def env_steps(names: tuple[str, ...], sizes: tuple[int, ...], session: Session) -> Measure:
     """Env steps a second under random actions, episodes started anew as in training."""
-
     chosen = [("pendulum", 8)] if session.toy else [(n, s) for n in names for s in sizes]
     programs = []
     for name, num_envs in chosen:
@@ -264,7 +263,7 @@ def training(session: Session) -> Measure:
     played on C MuJoCo on the host's cores, and drawn.
     """
     directory = session.work / "ant"
-    settings = ["--preset", "gpu", "--env", "ant", "--no-random-baseline"]
+    settings = ["--preset", "gpu", "--env", "ant"]
     if session.toy:
         settings = ["--preset", "smoke", "--env", "pendulum"]
     command = (sys.executable, "-m", "experiments.train", *settings, "--out", str(directory))
@@ -277,7 +276,7 @@ def training(session: Session) -> Measure:
         reported = 0
         while True:
             ended = run.poll() is not None
-            rows = runs.read_metrics(directory) if (directory / runs.METRICS).exists() else []
+            rows = runs.read_metrics(directory)
             if rows and not reported:
                 yield {
                     "section": "compiled",
@@ -525,11 +524,13 @@ def run_part(part: str, seconds: float, toy: bool, out: Path) -> list[Row]:
         arguments = part, seconds - PACKING, toy, rows, work
         process = multiprocessing.get_context("spawn").Process(target=measure, args=arguments)
         process.start()
-        process.join(until - PACKING - time.monotonic())
-        ended = process.exitcode  # None: its time is up
         assert process.pid is not None
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
+        try:
+            process.join(until - PACKING - time.monotonic())
+            ended = process.exitcode  # None: its time is up
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
         process.join()
         with tarfile.open(out / f"{part}.tar.gz", "w:gz") as archive:
             for path in sorted(work.rglob("*")):
