@@ -75,8 +75,8 @@ which_runs = Extension(
     extra_compile_args=["-O2", "-g0"],
     optional=True,
 )
-cuda_home = os.environ.get("CUDA_HOME")
-nvcc = shutil.which("nvcc", path=str(Path(cuda_home, "bin")) if cuda_home else None)
+# For NVIDIA's GPUs where it is asked for: the name or path of nvcc.
+nvcc = shutil.which(os.environ.get("MAXENT_JAX_NVCC", ""))
 for_gpus = Extension(
     "maxent_jax.native._cuda",
     [str(NATIVE / "knn.cu")],

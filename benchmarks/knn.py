@@ -92,7 +92,7 @@ def in_xla(queries: jax.Array, points: jax.Array) -> jax.Array:
 
 
 def in_cuda(queries: jax.Array, points: jax.Array) -> jax.Array:
-    """Ours in CUDA, where nvcc has built it."""
+    """Ours in CUDA, where it was built."""
     return search_in_cuda(NUM_NEIGHBORS, *_everyone(queries, points))
 
 

@@ -2,7 +2,7 @@
 
 An optional fast path: results are the same without it. The library is built once for each kind of
 processor. Nothing of a build runs where it cannot: a small library for the oldest processors
-(cpu.c) says which one to load. Where nvcc is, the search is built for NVIDIA's GPUs too (knn.cu).
+(cpu.c) says which one to load. The search can be built for NVIDIA's GPUs too (knn.cu).
 """
 
 import ctypes
