@@ -141,8 +141,11 @@ def main() -> None:
     flags = common.parser(__doc__)
     flags.add_argument("--only", nargs="*", help="beginnings of the programs' names")
     args = flags.parse_args()
+    try:
+        chips = topologies.get_topology_desc("h100", "cuda", target_config=H100, topology="1x1x1")
+    except NotImplementedError:
+        flags.error('XLA\'s compiler for GPUs is not installed: pip install "jax[cuda13]".')
     common.print_versions()
-    chips = topologies.get_topology_desc("h100", "cuda", target_config=H100, topology="1x1x1")
     config = preset("gpu", env="ant", backend="mjx").program()
     state = jax.eval_shape(functools.partial(algorithm.start, config))
     part = lambda function: (functools.partial(function, config), (state,))

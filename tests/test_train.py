@@ -335,6 +335,14 @@ def test_what_a_gpu_is_asked_runs_on_a_cpu(tmp_path):
 
 
 @pytest.mark.slow
+def test_without_a_compiler_for_gpus_nothing_is_asked_of_it():
+    line = [sys.executable, "-m", "benchmarks.gpu_compile", "--toy"]
+    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
+    asked = done.returncode == 0 and json.loads(done.stdout.splitlines()[-1])["kernels"] > 0
+    assert asked or (done.returncode == 2 and "jax[cuda13]" in done.stderr)
+
+
+@pytest.mark.slow
 def test_a_part_whose_time_is_up_keeps_its_rows(tmp_path):
     printed = benchmark("gpu", "--part", "first", "--seconds", "20", "--out", tmp_path)
     assert "programs compiled" in printed
