@@ -6,6 +6,7 @@ XLA, by blocks of points for CPUs and by one reduction for GPUs, and CUDA.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -101,11 +102,7 @@ def in_cpp(
         (num_queries, num_features), num_points = queries.shape, points.shape[0]
         many = num_queries >= TREE_QUERIES and num_points >= TREE_POINTS
         tree = many and num_features <= TREE_FEATURES
-    call = jax.ffi.ffi_call(
-        "maxent_knn",
-        jax.ShapeDtypeStruct((queries.shape[0], k), jnp.float32),
-        vmap_method="expand_dims",  # what is not mapped over is not copied
-    )
+    call = _foreign("maxent_knn", queries, k)
     return call(queries, points, labels, exclude, count, tree=tree)
 
 
@@ -122,12 +119,16 @@ def in_cuda(
     """
     if k > CUDA_NEIGHBORS or queries.shape[1] > CUDA_FEATURES:
         return by_reduction(k, queries, points, exclude, labels, count)
-    call = jax.ffi.ffi_call(
-        native.CUDA_TARGET,
+    return _foreign(native.CUDA_TARGET, queries, k)(queries, points, labels, exclude, count)
+
+
+def _foreign(target: str, queries: jax.Array, k: int) -> Callable[..., jax.Array]:
+    """A search of maxent_jax.native, by the name that XLA knows it by."""
+    return jax.ffi.ffi_call(
+        target,
         jax.ShapeDtypeStruct((queries.shape[0], k), jnp.float32),
-        vmap_method="expand_dims",
+        vmap_method="expand_dims",  # what is not mapped over is not copied
     )
-    return call(queries, points, labels, exclude, count)
 
 
 def by_blocks(

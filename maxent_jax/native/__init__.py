@@ -36,11 +36,7 @@ def library() -> ctypes.CDLL | None:
     name = variant()
     if name == NONE:
         return None
-    loaded = ctypes.CDLL(str(path(name)))
-    for target in TARGETS:
-        function = jax.ffi.pycapsule(getattr(loaded, target))
-        jax.ffi.register_ffi_target(target, function, platform="cpu")
-    return loaded
+    return _load(name, TARGETS, "cpu")
 
 
 @functools.cache
@@ -48,9 +44,15 @@ def cuda() -> ctypes.CDLL | None:
     """The build for NVIDIA's GPUs, its function known to XLA; None where there is none."""
     if not path("cuda").exists():
         return None
-    loaded = ctypes.CDLL(str(path("cuda")))
-    function = jax.ffi.pycapsule(getattr(loaded, CUDA_TARGET))
-    jax.ffi.register_ffi_target(CUDA_TARGET, function, platform="CUDA")
+    return _load("cuda", (CUDA_TARGET,), "CUDA")
+
+
+def _load(name: str, targets: tuple[str, ...], platform: str) -> ctypes.CDLL:
+    """A build, its functions known to XLA on that platform."""
+    loaded = ctypes.CDLL(str(path(name)))
+    for target in targets:
+        function = jax.ffi.pycapsule(getattr(loaded, target))
+        jax.ffi.register_ffi_target(target, function, platform=platform)
     return loaded
 
 
