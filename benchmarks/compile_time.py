@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import common
-from maxent_jax import runs
-from maxent_jax.choices import ENVS
 from maxent_jax.config import preset
-from maxent_jax.presets import PRESETS
+from maxent_jax.config.names import ENVS
+from maxent_jax.config.presets import PRESETS
+from maxent_jax.runs import files
 
 TRAIN = ("-m", "experiments.train", "--num-iterations", "1")
 
@@ -34,7 +34,7 @@ def first_step(env: str, name: str, directory: Path, cache: Path) -> float:
         capture_output=True,
         check=True,
     )
-    (row,) = runs.read_metrics(directory)
+    (row,) = files.read_metrics(directory)
     return row["wall_first_step"]
 
 

@@ -20,11 +20,12 @@ import numpy as np
 from mujoco import rollout
 
 from benchmarks import common
-from maxent_jax import envs, runtime
-from maxent_jax.choices import PHYSICS
+from maxent_jax import envs
 from maxent_jax.config import Config
+from maxent_jax.config.names import PHYSICS
 from maxent_jax.envs import base, physics
 from maxent_jax.envs.task import MujocoEnv
+from maxent_jax.runs import runtime
 
 # Random actions before a workload starts: an ant has landed, the others have not fallen yet.
 SETTLE_STEPS = {"ant": 40, "walker2d": 5, "humanoid": 5}

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks import common
-from maxent_jax import parts
+from maxent_jax import components
 from maxent_jax.config import Config, preset
 from maxent_jax.envs import base
 from maxent_jax.sac import agent, losses, replay
@@ -21,7 +21,7 @@ from maxent_jax.sac import agent, losses, replay
 
 @functools.partial(jax.jit, static_argnums=0)
 def init(config: Config, key: jax.Array):
-    p = parts.make(config)
+    p = components.make(config)
     key_agent, key_episodes = jax.random.split(key)
     episodes = base.init(p.env, config.num_envs, config.num_starts, key_episodes)
     scalar, state = jnp.zeros(()), jnp.zeros(p.sac.observation_size)
@@ -32,7 +32,7 @@ def init(config: Config, key: jax.Array):
 
 def step(config: Config, carry, key: jax.Array):
     """All envs once, then the gradient steps; also the mean forward velocity of the step."""
-    p = parts.make(config)
+    p = components.make(config)
     learner, episodes, ring = carry
     key_act, key_env, key_sample, key_update = jax.random.split(key, 4)
     action = agent.act(p.sac, learner.parameters.policy, episodes.env.obs, key_act)

@@ -34,10 +34,11 @@ import numpy as np
 
 import benchmarks.envs
 from benchmarks import common, knn, sac
-from maxent_jax import algorithm, envs, native, runs, runtime
+from maxent_jax import algorithm, envs, native
+from maxent_jax.algorithm.experience import Reference
 from maxent_jax.config import Config, preset
 from maxent_jax.envs import base
-from maxent_jax.experience import Reference
+from maxent_jax.runs import files, runtime
 
 SECONDS = 300.0  # of a part
 PACKING = 5.0  # seconds of these, to pack what there is
@@ -276,7 +277,7 @@ def training(session: Session) -> Measure:
         reported = 0
         while True:
             ended = run.poll() is not None
-            rows = runs.read_metrics(directory)
+            rows = files.read_metrics(directory)
             if rows and not reported:
                 yield {
                     "section": "compiled",

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import common
-from maxent_jax import analysis, native, runs
+from maxent_jax import analysis, errors, native
 from maxent_jax.density.knn import by_blocks, knn_distances
 from maxent_jax.density.knn import in_cuda as search_in_cuda
+from maxent_jax.runs import files
 
 NUM_NEIGHBORS, NUM_FEATURES = 3, 7  # k and p of the paper
 SIZES = ((64, 16_384), (4096, 65_536), (4096, 1_000_000))  # queries, points
@@ -264,8 +265,8 @@ def main() -> None:
     args = flags.parse_args()
     try:
         if args.run is not None:
-            runs.read_config(args.run)
-    except runs.RunError as mistake:
+            files.read_config(args.run)
+    except errors.RunError as mistake:
         flags.error(str(mistake))
     common.print_versions(PEERS)
     peers = common.importable(PEERS)

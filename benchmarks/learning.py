@@ -20,7 +20,7 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from benchmarks import common
-from maxent_jax import runs
+from maxent_jax.runs import files
 
 # What each regime changes of the preset.
 REGIMES: dict[str, dict[str, Any]] = {
@@ -111,7 +111,7 @@ def run(name: str, seed: int, base: dict[str, Any], cores: set[int]) -> dict[str
         _, errors = process.communicate()
         if process.returncode != 0:
             raise RuntimeError(f"{name}, seed {seed}: {errors}")
-        rows = runs.read_metrics(Path(folder))
+        rows = files.read_metrics(Path(folder))
     columns = {key: [row[key] for row in rows] for key in KEPT if key in rows[-1]}
     changes = REGIMES[name]
     return {"benchmark": "learning", "regime": name, "changes": changes, "seed": seed} | columns
@@ -153,7 +153,7 @@ def study(names, seeds, base, jobs: int, out: Path) -> Iterator[dict[str, Any]]:
                 continue
             row = future.result()
             done.append(row)
-            runs.write_json(out, {"base": base, "rows": done})
+            files.write_json(out, {"base": base, "rows": done})
             yield row
     if failed:
         raise RuntimeError(f"{failed} runs failed; the others are in {out}")

@@ -20,11 +20,12 @@ import numpy as np
 
 from benchmarks import common
 from benchmarks.envs import scan, settled
-from maxent_jax import algorithm, envs, parts, runtime
+from maxent_jax import algorithm, components, envs
 from maxent_jax.config import preset
 from maxent_jax.envs import base
 from maxent_jax.envs.physics import REFERENCE, Options
 from maxent_jax.envs.task import MujocoEnv
+from maxent_jax.runs import runtime
 
 DRIFT_STEPS = (1, 10, 50)
 NUM_STEPS, CHUNK = 200, 20  # of each env, without resets
@@ -202,7 +203,7 @@ def survive(name: str, num_steps: int, num_envs: int) -> dict[str, Any]:
 def learn(name: str, label: str, seed: int) -> dict[str, Any]:
     """One iteration of preset `quick` on a physics; the mixture is played there too."""
     envs.TASKS[name] = envs.TASKS[name]._replace(fast=OPTIONS[name][label])
-    parts._make.cache_clear()
+    components._make.cache_clear()
     jax.clear_caches()  # which know the environment by its name
     config = preset("quick", env=name, physics="fast", backend="mujoco", seed=seed)
     started = time.perf_counter()

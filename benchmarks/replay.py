@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks import common
-from maxent_jax import experience, parts
-from maxent_jax.choices import MUJOCO_ENVS
+from maxent_jax import components
+from maxent_jax.algorithm import experience
+from maxent_jax.algorithm.experience import Reference
 from maxent_jax.config import Config, preset
-from maxent_jax.experience import Reference
+from maxent_jax.config.names import MUJOCO_ENVS
 from maxent_jax.sac import replay
 from maxent_jax.sac.replay import Replay
 from maxent_jax.types import Transition
@@ -30,13 +31,13 @@ def num_bytes(tree: Any) -> int:
 
 def both_observations(config: Config) -> int:
     """Bytes of a float32 buffer of observation, action, reward, next observation and done flag."""
-    sac = parts.make(config).sac
+    sac = components.make(config).sac
     return 4 * config.replay_size * (2 * sac.observation_size + sac.action_size + 2)
 
 
 def ring_of(config: Config, full: bool) -> Replay:
     """Empty, or as if every environment had gone on for as long as the ring is, without an end."""
-    ring = experience.init(parts.make(config))
+    ring = experience.init(components.make(config))
     if not full:
         return ring
     rows = jnp.arange(config.replay_size, dtype=jnp.int32)
@@ -50,7 +51,7 @@ def ring_of(config: Config, full: bool) -> Replay:
 
 def insert_seconds(config: Config, full: bool, repeats: int) -> float:
     """Of one step of all envs, in a donated scan; the search of its distances included."""
-    p = parts.make(config)
+    p = components.make(config)
     n, sac = config.num_envs, p.sac
     state = jnp.ones((n, sac.observation_size))
     flags = jnp.zeros((3, n), bool)
@@ -83,7 +84,7 @@ def insert_seconds(config: Config, full: bool, repeats: int) -> float:
 
 def sample_seconds(config: Config, repeats: int) -> float:
     """Of drawing one batch from a full replay."""
-    p = parts.make(config)
+    p = components.make(config)
     starts = jnp.ones((config.num_starts, p.sac.observation_size))
     ring = ring_of(config, full=True)
     sample = jax.jit(functools.partial(experience.sample, p, shape=(config.batch_size,)))
@@ -95,7 +96,7 @@ def measure(env: str, capacity: int, repeats: int) -> Iterator[dict[str, Any]]:
     for dtype in ("float32", "float16"):
         settings = {"replay_size": capacity, "replay_dtype": dtype, "yaw_copies": 0}
         config = preset("quick", env=env, **settings)
-        ring = jax.eval_shape(lambda c=config: experience.init(parts.make(c)))
+        ring = jax.eval_shape(lambda c=config: experience.init(components.make(c)))
         assert replay.capacity_of(ring) == capacity
         size = num_bytes(ring)
         empty, full = (insert_seconds(config, full, repeats) for full in (False, True))

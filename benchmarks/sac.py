@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import common, seeds
-from maxent_jax import runtime
 from maxent_jax.config import preset
+from maxent_jax.runs import runtime
 from maxent_jax.sac import agent, losses
 
 OBSERVATION_SIZE, ACTION_SIZE = 29, 8  # Ant

@@ -8,10 +8,11 @@ from collections.abc import Iterator
 from typing import Any
 
 from benchmarks import common
-from maxent_jax import algorithm, runtime
-from maxent_jax.choices import BACKENDS, ENVS
+from maxent_jax import algorithm
 from maxent_jax.config import preset
-from maxent_jax.presets import PRESETS
+from maxent_jax.config.names import BACKENDS, ENVS
+from maxent_jax.config.presets import PRESETS
+from maxent_jax.runs import runtime
 
 
 def seconds_per_segment(config, repeats: int) -> float:

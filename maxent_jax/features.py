@@ -72,7 +72,7 @@ def make_feature_map(env_name: str) -> Features:
     own = envs.entry(env_name).phi
     if own is not None:
         return own
-    path = resources.files("maxent_jax") / "tables" / f"features_{env_name}.json"
+    path = resources.files("maxent_jax.envs") / "tables" / f"features_{env_name}.json"
     if not path.is_file():
         return _default(observation_size(envs.make(env_name)))
     table = json.loads(path.read_text(encoding="utf-8"))

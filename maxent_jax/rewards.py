@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from maxent_jax.choices import check_number, check_whole
+from maxent_jax.checks import check_number, check_whole
 from maxent_jax.density.entropy import log_density
 from maxent_jax.density.knn import knn_distances, smallest_k
 

@@ -9,7 +9,7 @@ import filelock
 import jax
 import pytest
 
-from maxent_jax import runtime
+from maxent_jax.runs import runtime
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 runtime.prepare(simulates_in_jax=True)

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from maxent_jax import algorithm, experience, mixture, occupancy, parts, training
+from maxent_jax import algorithm, components, mixture
+from maxent_jax.algorithm import experience, training
 from maxent_jax.config import preset
+from maxent_jax.mixture import occupancy
 from maxent_jax.sac import agent
 
 TINY = dict(num_segments=1, mixture_episodes=4, num_iterations=3, shaping=1.0, backend="mujoco")
@@ -39,7 +41,7 @@ def stages(method):
 
 @functools.lru_cache
 def compiled_step(program):
-    return jax.jit(functools.partial(training.step, parts.make(program)))
+    return jax.jit(functools.partial(training.step, components.make(program)))
 
 
 def leaves_equal(a, b):
@@ -137,7 +139,7 @@ def test_h_starts_from_scratch_la_goes_on_and_v_from_the_best():
 
 def test_an_archived_policy_keeps_the_moments_that_it_was_trained_with():
     config = tiny(normalize_inputs=True, actor_average=0.1)
-    p, state = parts.make(config), algorithm.start(config)
+    p, state = components.make(config), algorithm.start(config)
     states = jax.random.normal(jax.random.key(1), (5, 29))
 
     def acts(state):
@@ -192,7 +194,7 @@ def test_fully_corrective_weights_are_measured_on_episodes_that_they_were_not_fi
     monkeypatch.setattr(occupancy, "corrected", fit)
     monkeypatch.setattr(occupancy, "measures", measure)
     config = preset("smoke", env="pendulum", weights="fully_corrective", mixture_episodes=8)
-    p = parts.make(config)
+    p = components.make(config)
     program = jax.jit(lambda state: (algorithm.end(config, state)[1], dict(seen)))
     metrics, found = program(algorithm.start(config))  # two policies alike, each with its noise
     assert not np.array_equal(found["fitted"].states, found["measured"].states)
@@ -213,7 +215,10 @@ def test_a_frozen_reference_leaves_every_stored_distance_current(method):
     ring = trained.learner.replay
     assert int(ring.size) == 800  # half of it from before the refresh
     anew = experience.measure_all(
-        parts.make(config), trained.learner.reference, ring, trained.learner.episodes.starts.obs
+        components.make(config),
+        trained.learner.reference,
+        ring,
+        trained.learner.episodes.starts.obs,
     )
     for name, stored in ring.items.distances._asdict().items():
         assert (stored[: int(ring.size)] > 0).any()
@@ -257,7 +262,7 @@ def test_the_refresh_period_counts_steps_of_all_envs(period, refreshes):
 
 def test_the_history_holds_what_was_visited():
     config, _, _, _, trained = stages("la")
-    p = parts.make(config)
+    p = components.make(config)
     ring = trained.learner.replay
     visited = np.asarray(p.phi(ring.items.state[: int(ring.size)]))
     history = np.asarray(trained.learner.history.points)

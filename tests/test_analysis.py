@@ -16,12 +16,13 @@ from nbclient import NotebookClient
 from untrained import make_run
 
 import maxent_jax
-from maxent_jax import analysis, features, runs
+from maxent_jax import analysis, features
 from maxent_jax.analysis import Paths
-from maxent_jax.choices import ConfigError
 from maxent_jax.commands import evaluate
 from maxent_jax.config import preset
+from maxent_jax.errors import ConfigError
 from maxent_jax.moments import Moments
+from maxent_jax.runs import files
 
 ROOT = Path(__file__).parent.parent
 NOTEBOOK = ROOT / "docs" / "analysis.ipynb"
@@ -68,7 +69,7 @@ def test_a_frame_without_pandas_is_one_sentence(run, monkeypatch):
 def test_features_are_the_environments(run, visited):
     phi = features.make_feature_map("ant")
     found = run.features(np.asarray(visited.states[:5]))
-    assert found.shape == (5, len(run.parts.phi.names)) == (5, 7)
+    assert found.shape == (5, len(run.components.phi.names)) == (5, 7)
     np.testing.assert_array_equal(found, phi(visited.states[:5]))
 
 
@@ -160,7 +161,7 @@ def test_evaluate_measures_the_gap_to_gymnasium(run, directory, capsys):
 
 
 def test_evaluate_says_where_gymnasium_has_no_such_environment(tmp_path):
-    runs.write_config(tmp_path, preset("smoke", env="pendulum"), {}, {})
+    files.write_config(tmp_path, preset("smoke", env="pendulum"), {}, {})
     (tmp_path / "checkpoints" / "1").mkdir(parents=True)
     with pytest.raises(ConfigError, match="pendulum is not played in Gymnasium"):
         evaluate.main([str(tmp_path), "--gymnasium"])

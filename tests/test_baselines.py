@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from maxent_jax import algorithm, experience, methods, parts, training
-from maxent_jax.bonuses import Bonus
-from maxent_jax.choices import BASELINES
+from maxent_jax import algorithm, components
+from maxent_jax.algorithm import experience, methods, training
 from maxent_jax.config import preset
+from maxent_jax.config.names import BASELINES
 from maxent_jax.density import histogram
+from maxent_jax.intrinsic import Bonus
 
 STEPS = 12
 STILL = ("re3", "rise", "renyi", "vcse")  # have nothing to learn
@@ -26,7 +27,7 @@ def config_of(method, **changes):
 def trained(method):
     """The first learner, that after some steps of all envs, and what was measured."""
     config = config_of(method)
-    p = parts.make(config)
+    p = components.make(config)
     state = algorithm.start(config)
 
     @jax.jit
@@ -43,7 +44,7 @@ def trained(method):
 
 def visited(p, state):
     """As if a mixture had been in the bottom cell alone."""
-    from maxent_jax.occupancy import Occupancy
+    from maxent_jax.mixture.occupancy import Occupancy
 
     states = state.learner.episodes.starts.obs[:1]
     one = jnp.ones(1)
@@ -98,7 +99,7 @@ def test_a_baseline_goes_on_from_where_it_was_and_is_its_last_policy():
 @pytest.mark.slow
 def test_an_episode_forgets_the_one_before_it():
     config = config_of("ngu", episode_length=5, reference_size=32)
-    p, state = parts.make(config), algorithm.start(config)
+    p, state = components.make(config), algorithm.start(config)
 
     @jax.jit
     def run(learner, keys):
@@ -135,7 +136,7 @@ COLUMNS = {
 @pytest.mark.parametrize("what", COLUMNS)
 def test_a_bonus_is_shown_what_was_drawn_and_pays_before_it_learns(what):
     config = config_of("rnd", updates_per_step=0.5)
-    p = parts.make(config)._replace(bonus=payer(COLUMNS[what]))
+    p = components.make(config)._replace(bonus=payer(COLUMNS[what]))
     state = algorithm.start(config)
     learner = state.learner._replace(bonus=jnp.zeros(()))
     step = jax.jit(functools.partial(training.step, p, state.method))
@@ -191,7 +192,7 @@ def test_health_ends_an_episode_only_where_it_should(ends):
 
 
 def test_what_a_bonus_cannot_have_is_said():
-    from maxent_jax.choices import ConfigError
+    from maxent_jax.errors import ConfigError
 
     with pytest.raises(ConfigError, match="return-steps must be 1"):
         preset("quick", bonus="rnd")

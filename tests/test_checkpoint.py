@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import maxent_jax
-from maxent_jax import algorithm, checkpoint, envs, integrity, runs
-from maxent_jax.checkpoint import Progress
+from maxent_jax import algorithm, envs, errors
 from maxent_jax.config import preset
 from maxent_jax.envs.pendulum import Pendulum
-from maxent_jax.runs import driver
-from maxent_jax.runs.interruption import Interrupted, Interruption
+from maxent_jax.runs import checkpoint, driver, files, integrity
+from maxent_jax.runs.checkpoint import Progress
+from maxent_jax.runs.signals import Interrupted, Interruption
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -25,13 +25,13 @@ def arrays(state):
 
 
 def timeless(directory):
-    rows = runs.read_metrics(directory)
+    rows = files.read_metrics(directory)
     return [{k: v for k, v in row.items() if not k.startswith("wall_")} for row in rows]
 
 
 def restored(directory):
     name, _ = integrity.find(directory)
-    return arrays(checkpoint.restore(directory, name, runs.read_config(directory)))
+    return arrays(checkpoint.restore(directory, name, files.read_config(directory)))
 
 
 class StopAt(Interruption):
@@ -79,7 +79,7 @@ def test_a_run_stopped_anywhere_ends_as_one_that_was_not(tmp_path, monkeypatch, 
 
 def test_a_checkpoint_holds_all_that_was_measured(tmp_path):
     config = preset("smoke", env="pendulum")
-    runs.write_config(tmp_path, config, {}, {})
+    files.write_config(tmp_path, config, {}, {})
     state = algorithm.start(config)
     begun = {"weights": np.array([1, 0], np.float32), "num": np.array(3)}
     segments = [{"reward": np.array(np.nan, np.float32)}, {"reward": np.array(0.1, np.float32)}]
@@ -100,7 +100,7 @@ def test_a_checkpoint_holds_all_that_was_measured(tmp_path):
 
 def test_two_checkpoints_are_kept(tmp_path):
     config = preset("smoke", env="pendulum")
-    runs.write_config(tmp_path, config, {}, {})
+    files.write_config(tmp_path, config, {}, {})
     state = algorithm.start(config)
     for i in range(4):
         checkpoint.save(tmp_path, state, Progress([{}] * i, None, [], {}), {})
@@ -109,9 +109,9 @@ def test_two_checkpoints_are_kept(tmp_path):
 
 def test_a_checkpoint_of_another_config_does_not_fit(tmp_path):
     config = preset("smoke", env="pendulum")
-    runs.write_config(tmp_path, config, {}, {})
+    files.write_config(tmp_path, config, {}, {})
     checkpoint.save(tmp_path, algorithm.start(config), Progress([], None, [], {}), {})
-    with pytest.raises(runs.CheckpointError, match="does not fit its config"):
+    with pytest.raises(errors.CheckpointError, match="does not fit its config"):
         checkpoint.restore_results(tmp_path, "0", preset("smoke", env="pendulum", hidden_size=16))
 
 
@@ -166,7 +166,7 @@ def test_any_pytree_of_states_is_saved_and_comes_back(tmp_path):
     envs.register("strange", lambda backend, physics: Strange())
     config = preset("smoke", env="user:strange", num_iterations=1)
     state = algorithm.start(config)
-    runs.write_config(tmp_path, config, {}, {})
+    files.write_config(tmp_path, config, {}, {})
     checkpoint.save(tmp_path, state, Progress([], {}, [], {}), {})
     back = checkpoint.restore(tmp_path, integrity.find(tmp_path)[0], config)
     assert jax.tree.structure(back) == jax.tree.structure(state)

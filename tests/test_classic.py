@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from maxent_jax import envs
-from maxent_jax.choices import ConfigError
 from maxent_jax.density import histogram
 from maxent_jax.envs import mountain_car, pendulum
+from maxent_jax.errors import ConfigError
 
 NUM_STATES, NUM_STEPS = 100, 1000
 IDS = {"pendulum": "Pendulum-v1", "mountain_car": "MountainCarContinuous-v0"}

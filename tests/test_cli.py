@@ -13,10 +13,12 @@ from pathlib import Path
 import jax
 import pytest
 
-from maxent_jax import envs, headless, integrity, machine, runs, runtime
-from maxent_jax.choices import UsageError
+from maxent_jax import envs, errors
 from maxent_jax.commands import cli, streams, train
 from maxent_jax.config import preset
+from maxent_jax.errors import UsageError
+from maxent_jax.runs import files, integrity, machine, runtime
+from maxent_jax.visual import headless
 
 ROOT = Path(__file__).parent.parent
 SMOKE = ["--preset", "smoke", "--env", "pendulum", "--out"]
@@ -185,7 +187,7 @@ def test_what_the_system_refuses_is_one_sentence(capsys):
 
 
 def test_a_path_with_a_line_break_keeps_the_sentence_on_one_line(capsys):
-    assert ended(runs.RunError("a\nb is no run."), capsys) == (2, "error: a b is no run.\n")
+    assert ended(errors.RunError("a\nb is no run."), capsys) == (2, "error: a b is no run.\n")
 
 
 def test_settings_for_other_programs_end_no_command(monkeypatch):
@@ -224,7 +226,7 @@ def test_an_empty_out_is_refused():
 def begin(directory):
     """What a run leaves that was killed before its first checkpoint."""
     (directory / integrity.FOLDER / "unfinished-0+1").mkdir(parents=True)
-    runs.write_config(directory, preset("smoke", env="pendulum", seed=3), {}, {})
+    files.write_config(directory, preset("smoke", env="pendulum", seed=3), {}, {})
     for name in ("metrics.jsonl", "lock", "config.tmp.json"):
         (directory / name).write_text("")
 
@@ -236,7 +238,7 @@ def test_a_directory_without_a_checkpoint_is_nobodys_run(tmp_path, flags):
 
 
 def user_config(run):
-    (run / runs.CONFIG).write_text(json.dumps({"model_type": "mine"}))
+    (run / files.CONFIG).write_text(json.dumps({"model_type": "mine"}))
 
 
 @pytest.mark.parametrize(
@@ -244,10 +246,10 @@ def user_config(run):
     [
         user_config,
         lambda run: (run / "thesis.tex").write_text(""),
-        lambda run: (run / runs.METRICS).write_text("{}\n"),
+        lambda run: (run / files.METRICS).write_text("{}\n"),
         lambda run: (run / integrity.FOLDER / "mine").mkdir(),
         lambda run: (run / integrity.FOLDER / "1").mkdir(),
-        lambda run: [(run / "tensorboard").mkdir(), (run / runs.CONFIG).unlink()],
+        lambda run: [(run / "tensorboard").mkdir(), (run / files.CONFIG).unlink()],
     ],
 )
 def test_a_directory_with_anything_else_in_it_is_left_alone(tmp_path, change):
@@ -263,7 +265,7 @@ def test_a_config_of_the_users_is_not_removed_as_a_run(tmp_path):
     arguments = train.read_arguments([*SMOKE, str(tmp_path), "--overwrite"])
     with pytest.raises(UsageError, match="left as it is"), train.claimed(arguments):
         pass
-    assert (tmp_path / runs.CONFIG).exists()
+    assert (tmp_path / files.CONFIG).exists()
 
 
 def test_a_busy_directory_without_a_checkpoint_stays_busy(tmp_path):
@@ -321,7 +323,7 @@ def test_a_run_whose_terminal_closes_is_saved(tmp_path):
         start_new_session=True,
     )
     os.close(theirs)
-    while not runs.read_metrics(run):
+    while not files.read_metrics(run):
         os.read(ours, 1000)
         assert process.poll() is None
         time.sleep(0.01)

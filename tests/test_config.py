@@ -4,9 +4,10 @@ import dataclasses
 
 import pytest
 
-from maxent_jax.choices import ENVS, METHODS, ConfigError
 from maxent_jax.config import Config, preset
-from maxent_jax.presets import PRESETS
+from maxent_jax.config.names import ENVS, METHODS
+from maxent_jax.config.presets import PRESETS
+from maxent_jax.errors import ConfigError
 
 
 @pytest.mark.parametrize("env", [*ENVS, "brax:halfcheetah", "user:mine"])
@@ -102,13 +103,15 @@ def test_a_hybrid_of_methods_is_named():
 
 
 def test_choices_are_those_of_the_modules_that_make_them():
-    from maxent_jax import bonuses, choices, envs, methods, rewards
+    from maxent_jax import envs, intrinsic, rewards
+    from maxent_jax.algorithm import methods
+    from maxent_jax.config import names
 
     torsos = {name: task.torso for name, task in envs.TASKS.items() if task.torso is not None}
-    assert set(choices.MUJOCO_ENVS) == set(envs.TASKS)
-    assert set(choices.CLASSIC_ENVS) == set(envs.CLASSIC)
-    assert set(choices.TORSO_ENVS) == set(torsos)
-    assert set(choices.METHODS) == set(methods.ROWS)
-    assert set(choices.BONUSES) == set(bonuses.NAMES)
-    assert set(choices.REWARDS) == set(rewards.FORMS)
-    assert set(choices.STARTS) == {"method", *methods.STARTS}
+    assert set(names.MUJOCO_ENVS) == set(envs.TASKS)
+    assert set(names.CLASSIC_ENVS) == set(envs.CLASSIC)
+    assert set(names.TORSO_ENVS) == set(torsos)
+    assert set(names.METHODS) == set(methods.ROWS)
+    assert set(names.BONUSES) == set(intrinsic.NAMES)
+    assert set(names.REWARDS) == set(rewards.FORMS)
+    assert set(names.STARTS) == {"method", *methods.STARTS}

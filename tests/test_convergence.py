@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from maxent_jax.convergence import has_plateaued
+from maxent_jax.algorithm.convergence import has_plateaued
 
 STEPS = np.arange(60)
 SATURATING = 1 - np.exp(-STEPS / 5)

@@ -11,7 +11,8 @@ import pytest
 from brax.envs.base import Env, State
 from untrained import make_run
 
-from maxent_jax import dataset, envs
+from maxent_jax import envs
+from maxent_jax.analysis import dataset
 
 LENGTH = 100  # the time limit of the preset
 
@@ -57,7 +58,7 @@ def test_episodes_are_contiguous_and_end_once(rows, ended):
 
 
 def test_terminals_are_unhealthy_and_timeouts_are_late(run, rows, ended):
-    healthy = run.parts.env.task.healthy(rows["next_observations"])
+    healthy = run.components.env.task.healthy(rows["next_observations"])
     np.testing.assert_array_equal(rows["terminals"], ~np.asarray(healthy))
     lengths = np.diff(np.flatnonzero(ended), prepend=-1)
     late = rows["timeouts"][ended]

@@ -15,10 +15,10 @@ from pathlib import Path
 import commands
 import pytest
 
-from maxent_jax import integrity, runs
-from maxent_jax.choices import ConfigError
+from maxent_jax.algorithm.devices import make_mesh
 from maxent_jax.config import preset
-from maxent_jax.devices import make_mesh
+from maxent_jax.errors import ConfigError
+from maxent_jax.runs import files, integrity
 
 ROOT = Path(__file__).parent.parent
 SMOKE = ("--preset", "smoke", "--env", "pendulum", "--num-iterations", "4")
@@ -136,7 +136,7 @@ def start_two(directory, logs, *flags):
 def test_two_processes_train_one_run_and_end_together(tmp_path):
     directory, logs = tmp_path / "run", tmp_path / "logs"
     processes = start_two(directory, logs)
-    metrics = directory / runs.METRICS
+    metrics = directory / files.METRICS
     deadline = time.time() + 120
     while time.time() < deadline and not (metrics.exists() and metrics.read_text()):
         time.sleep(0.1)
@@ -148,7 +148,7 @@ def test_two_processes_train_one_run_and_end_together(tmp_path):
     again = tmp_path / "again"
     for index, process in enumerate(start_two(directory, again, "--resume")):
         assert process.wait(timeout=240) == 0, (again / str(index)).read_text()
-    assert [row["env_steps"] for row in runs.read_metrics(directory)] == [400, 800, 1200, 1600]
+    assert [row["env_steps"] for row in files.read_metrics(directory)] == [400, 800, 1200, 1600]
     assert (directory / "figures" / "curves.png").exists()
 
 
@@ -158,7 +158,7 @@ def test_two_processes_stop_together_when_one_is_asked_to(tmp_path):
     many = ("--num-iterations", "40", "--mixture-episodes", "41")
     processes = start_two(directory, logs, *many)
     deadline = time.time() + 120
-    while time.time() < deadline and not runs.read_metrics(directory):
+    while time.time() < deadline and not files.read_metrics(directory):
         time.sleep(0.1)
     processes[1].send_signal(signal.SIGTERM)
     assert [process.wait(timeout=60) for process in processes] == [143, 143]

@@ -11,9 +11,10 @@ from brax import envs as brax_envs
 from brax.envs.wrappers import training
 
 from maxent_jax import envs, features
-from maxent_jax.choices import BACKENDS, BRAX_ENVS, ENVS, PHYSICS, ConfigError
+from maxent_jax.config.names import BACKENDS, BRAX_ENVS, ENVS, PHYSICS
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import task
+from maxent_jax.errors import ConfigError
 
 
 @pytest.fixture(scope="module")

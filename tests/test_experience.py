@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from maxent_jax import experience, parts, training
+from maxent_jax import components
+from maxent_jax.algorithm import experience, training
+from maxent_jax.algorithm.experience import Reference
 from maxent_jax.config import preset
-from maxent_jax.experience import Reference
 from maxent_jax.types import Distances, Outcomes, Transition
 
 NUM_ENVS, CAPACITY, SIZE = 3, 24, 29
@@ -20,7 +21,7 @@ def make(**changes):
     """A small ring, Ant's unless said; the environment itself is not stepped."""
     sizes = dict(num_envs=NUM_ENVS, replay_size=CAPACITY, batch_size=4)
     budget = dict(updates_per_step=1.0, steps_per_iteration=NUM_ENVS * 15)
-    return parts.make(preset("quick", **{**sizes, **budget, "return_steps": 1, **changes}))
+    return components.make(preset("quick", **{**sizes, **budget, "return_steps": 1, **changes}))
 
 
 def states(rng, num, size=SIZE):
@@ -200,7 +201,7 @@ def test_16_bits_hold_what_is_too_large_for_them_as_their_largest():
 
 
 def bytes_of(config):
-    shapes = jax.eval_shape(lambda: experience.init(parts.make(config)))
+    shapes = jax.eval_shape(lambda: experience.init(components.make(config)))
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
 
 

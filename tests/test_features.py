@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from maxent_jax import features
-from maxent_jax.choices import CLASSIC_ENVS, MUJOCO_ENVS, ConfigError
+from maxent_jax.config.names import CLASSIC_ENVS, MUJOCO_ENVS
+from maxent_jax.errors import ConfigError
 from maxent_jax.features import make_feature_map
 
 COORDINATES = {"ant": (("x", 0), ("y", 1)), "walker2d": (("x", 0), ("z", 1))}

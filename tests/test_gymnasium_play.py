@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from untrained import make_run
 
-from maxent_jax import gymnasium_play, mixture
-from maxent_jax.choices import ConfigError
+from maxent_jax import mixture
+from maxent_jax.analysis import gymnasium_play
 from maxent_jax.config import preset
+from maxent_jax.errors import ConfigError
 
 ROBOTS = {
     "ant": dict(torque_limit=0.4, end_flipped=True, policy_inputs="heading"),
@@ -26,7 +27,7 @@ def make_pushing(env="ant", **changes):
     """Of policies that push with all they have, up and down, and of one that hardly moves."""
     run = make_run(env=env, backend="mujoco", **ROBOTS[env], **changes)
     output = run.mixture.parameters.actor["params"]["Dense_0"]
-    bias = jnp.repeat(jnp.array([[20.0], [-20.0], [0.0]]), run.parts.env.action_size, axis=1)
+    bias = jnp.repeat(jnp.array([[20.0], [-20.0], [0.0]]), run.components.env.action_size, axis=1)
     output["bias"] = jnp.concatenate([bias, jnp.full_like(bias, -9.0)], axis=1)
     return run
 
@@ -50,7 +51,7 @@ def visited_states(env, num_steps, key):
 @pytest.mark.parametrize("name", ROBOTS)
 def test_a_step_is_ours_from_equal_states(name):
     run = make_pushing(name)
-    ours, theirs = run.parts.env, gymnasium_play.make(run.config)
+    ours, theirs = run.components.env, gymnasium_play.make(run.config)
     states = jax.jit(lambda key: visited_states(ours, LENGTH, key))(jax.random.key(1))
     if name == "ant":  # on its back, for a third of them
         physics = states.pipeline_state
@@ -119,7 +120,7 @@ def test_an_episode_ends_with_health_or_the_time_limit(run):
     np.testing.assert_array_equal(played.alive, np.arange(LENGTH) < lived[:, None])
     assert not played.states[~played.alive].any()
     last = played.states[np.arange(12), lived - 1]
-    env = run.parts.env
+    env = run.components.env
     ends = ~env.task.healthy(last) | env.task.torso.flipped(last)
     np.testing.assert_array_equal(ends | (lived == LENGTH), True)
     for states, number in zip(played.states, lived, strict=True):

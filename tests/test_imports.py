@@ -1,6 +1,7 @@
 """Data flows one way: imports point backwards only, and bad input is met before jax is loaded."""
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
@@ -10,44 +11,12 @@ import pytest
 import maxent_jax
 
 PACKAGE = Path(maxent_jax.__file__).parent
-# The reading order of the package, first to last.
-ORDER = [
-    *("types", "precision", "choices", "presets", "config", "convergence"),
-    *("runs", "integrity", "headless", "machine", "runtime", "native"),
-    *("runs.interruption", "runs.locks", "runs.sinks", "runs.display", "runs.clock", "runs.hosts"),
-    *("density.histogram", "density.knn", "density.sharding"),
-    *("density.entropy", "density.reservoir"),
-    *("envs.physics", "envs.mjx_backend", "envs.mujoco_backend", "envs.torso", "envs.task"),
-    *("envs.ant", "envs.walker2d", "envs.humanoid", "envs.pendulum", "envs.mountain_car"),
-    *("envs", "envs.base", "rollout", "features"),
-    *("rewards", "moments", "sac.networks", "sac.replay", "sac.losses", "sac.agent"),
-    *("mixture", "methods"),
-    *("bonuses.protocol", "bonuses.descent", "bonuses.particles"),
-    *("bonuses.rnd", "bonuses.icm", "bonuses.ngu", "bonuses.re3", "bonuses.rise", "bonuses.vcse"),
-    *("bonuses.kmeans", "bonuses.apt", "bonuses.histogram", "bonuses"),
-    *("theory.bounds", "theory.mdps", "theory.tabular", "theory.optimum", "theory.loop"),
-    *("theory.reference", "theory.peers", "theory.tabular_problems", "theory.tabular_studies"),
-    *("parts", "occupancy", "experience", "training", "algorithm"),
-    *("mepol.settings", "mepol.estimates", "mepol.ascent", "mepol"),
-    *("official.settings", "official.reinforce", "official.rounds", "official"),
-    *(
-        "devices",
-        "memory",
-        "checkpoint",
-        "dataset",
-        "export",
-        "analysis",
-        "gymnasium_play",
-        "plotting",
-    ),
-    *("theory.tabular_figures", "rendering", "film"),
-    *("visual.figures", "visual.tables", "visual.video", "runs.stages", "runs.driver"),
-    *("studies.statistics", "studies.protocol", "studies.raw", "studies.mepol_rows"),
-    *("studies.classic_weights", "studies.paper_figures", "studies.reproduced"),
-    *("commands.streams", "commands.cli", "commands.train", "commands.evaluate", "commands.render"),
-    *("commands.report", "commands.verify", "commands.reproduce", "commands.theory"),
-    *("commands", "__main__"),
-]
+# The reading order of the package's folders and single modules, first to last.
+ORDER = (
+    *("errors", "checks", "types", "precision", "moments", "config", "native", "density", "envs"),
+    *("rollout", "features", "rewards", "sac", "intrinsic", "components", "mixture", "algorithm"),
+    *("baselines", "runs", "analysis", "visual", "theory", "studies", "commands", "__main__"),
+)
 
 
 def module_name(path):
@@ -55,26 +24,36 @@ def module_name(path):
     return ".".join(p for p in parts if p != "__init__")
 
 
-def imported(path):
-    for node in ast.walk(ast.parse(path.read_text())):
+MODULES = {name: path for path in PACKAGE.rglob("*.py") if (name := module_name(path))}
+
+
+def imported(name):
+    """The modules of the package that a module imports."""
+    for node in ast.walk(ast.parse(MODULES[name].read_text())):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("maxent_jax"):
             prefix = node.module.removeprefix("maxent_jax").lstrip(".")
             for alias in node.names:
-                name = f"{prefix}.{alias.name}".lstrip(".")
-                yield name if name in ORDER else prefix
+                full = f"{prefix}.{alias.name}".lstrip(".")
+                if found := full if full in MODULES else prefix:
+                    yield found
 
 
-@pytest.mark.parametrize("name", ORDER)
-def test_a_module_imports_only_what_stands_before_it(name):
-    path = PACKAGE / (name.replace(".", "/") + ".py")
-    path = path if path.exists() else PACKAGE / name / "__init__.py"
-    later = {m for m in imported(path) if m and ORDER.index(m) >= ORDER.index(name)}
-    assert not later
+def room(name):
+    return ORDER.index(name.split(".")[0])
 
 
-def test_every_module_has_its_place_in_the_order():
-    found = {module_name(path) for path in PACKAGE.rglob("*.py")}
-    assert found - {"", "density", "sac", "studies", "theory", "visual"} == set(ORDER)
+@pytest.mark.parametrize("name", MODULES)
+def test_a_module_imports_no_folder_that_comes_later(name):
+    assert not {other for other in imported(name) if room(other) > room(name)}
+
+
+def test_imports_within_a_folder_form_no_cycle():
+    graph = {name: {m for m in imported(name) if room(m) == room(name)} for name in MODULES}
+    list(graphlib.TopologicalSorter(graph).static_order())
+
+
+def test_the_order_names_every_folder_and_no_other():
+    assert {name.split(".")[0] for name in MODULES} == set(ORDER)
 
 
 def test_the_command_line_is_checked_without_jax():

@@ -5,18 +5,19 @@ import subprocess
 
 import pytest
 
-from maxent_jax import integrity, runs
-from maxent_jax.integrity import FOLDER, MANIFEST
+from maxent_jax import errors
+from maxent_jax.runs import files, integrity
+from maxent_jax.runs.integrity import FOLDER, MANIFEST
 
 
 @pytest.fixture
 def run(tmp_path):
     """Two sealed checkpoints, without arrays."""
-    (tmp_path / runs.CONFIG).write_text("{}")
+    (tmp_path / files.CONFIG).write_text("{}")
     for name in ("9", "10+2"):
         folder = tmp_path / FOLDER / name
         (folder / "arrays" / "rest").mkdir(parents=True)
-        (folder / runs.CONFIG).write_text("{}")
+        (folder / files.CONFIG).write_text("{}")
         (folder / "arrays" / "data").write_bytes(os.urandom(1000))
         (folder / "arrays" / "rest" / "replay").write_bytes(os.urandom(1000))
         integrity.seal(folder)
@@ -42,22 +43,22 @@ def test_checkpoints_are_ordered_by_how_far_they_are(run):
 def test_analysis_passes_by_what_it_does_not_read(run):
     (run / FOLDER / "10+2" / "arrays" / "rest" / "replay").write_text("lost")
     assert integrity.find(run, whole=False) == ("10+2", {})
-    with pytest.raises(runs.CheckpointCorruptError, match="arrays/rest/replay"):
+    with pytest.raises(errors.CheckpointCorruptError, match="arrays/rest/replay"):
         integrity.find(run)
     name, passed_over = integrity.find(run, fallback=True)
     assert name == "9" and list(passed_over) == ["10+2"]
 
 
 def test_a_config_that_was_changed_by_hand_is_noticed(run):
-    (run / runs.CONFIG).write_text('{"seed": 1}')
-    with pytest.raises(runs.CheckpointCorruptError, match=r"config\.json of the run"):
+    (run / files.CONFIG).write_text('{"seed": 1}')
+    with pytest.raises(errors.CheckpointCorruptError, match=r"config\.json of the run"):
         integrity.find(run)
 
 
 def test_where_all_are_damaged_there_is_nothing_to_fall_back_to(run):
     for name in integrity.checkpoints(run):
         (run / FOLDER / name / MANIFEST).unlink()
-    with pytest.raises(runs.CheckpointCorruptError, match="none before it is intact"):
+    with pytest.raises(errors.CheckpointCorruptError, match="none before it is intact"):
         integrity.find(run, fallback=True)
 
 

@@ -5,10 +5,11 @@ import dataclasses
 import jax
 import pytest
 
-from maxent_jax import algorithm, machine, memory
-from maxent_jax.choices import ConfigError
+from maxent_jax import algorithm
 from maxent_jax.config import Config, preset
-from maxent_jax.machine import Room
+from maxent_jax.errors import ConfigError
+from maxent_jax.runs import machine, memory
+from maxent_jax.runs.machine import Room
 
 
 @pytest.fixture(scope="module")

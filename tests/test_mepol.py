@@ -11,11 +11,12 @@ import pytest
 from scipy import special, stats
 from scipy.spatial import cKDTree
 
-from maxent_jax import mepol, parts
+from maxent_jax import components
+from maxent_jax.baselines import mepol
+from maxent_jax.baselines.mepol import Settings, ascent, estimates
 from maxent_jax.config import preset
 from maxent_jax.density.entropy import knn_entropy
 from maxent_jax.envs import base, pendulum
-from maxent_jax.mepol import Settings, ascent, estimates
 
 LENGTHS = (40, 7, 23, 1, 30)  # of the episodes in a batch of unequal ones
 K = 4
@@ -39,7 +40,7 @@ def parts_of(limit):
     config = preset(
         "smoke", env="pendulum", episode_length=100, mixture_episodes=10, reference_size=512
     )
-    return parts.make(config)._replace(env=Fragile(limit))
+    return components.make(config)._replace(env=Fragile(limit))
 
 
 STURDY = 4.0  # only those who have learned to swing move faster

@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import minimize
 
 from maxent_jax import mixture
+from maxent_jax.mixture.weights import CORRECTIVE_ROUNDS
 from maxent_jax.sac.agent import Parameters
 
 
@@ -242,4 +243,4 @@ def test_weights_found_within_a_program_are_those_of_a_solver(seed):
 
     best = entropy(mixture.fully_corrective_weights(occupancies, 1e-12))
     assert entropy(np.full(6, 1 / 6)) < best - 1e-3  # so that there was something to find
-    assert best - entropy(found[:6]) < np.log(6) / mixture.CORRECTIVE_ROUNDS  # derived: its bound
+    assert best - entropy(found[:6]) < np.log(6) / CORRECTIVE_ROUNDS  # derived: its bound

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from maxent_jax import native
-from maxent_jax.choices import ConfigError
+from maxent_jax.errors import ConfigError
 
 QEMU = shutil.which("qemu-x86_64")
 HAS_COMPILER = any(shutil.which(name) for name in ("c++", "g++", "clang++"))

@@ -13,13 +13,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from maxent_jax import runs
-from maxent_jax.choices import ConfigError
-from maxent_jax.commands import cli, reproduce
+from maxent_jax import errors
+from maxent_jax.commands import reproduce, train
 from maxent_jax.config import preset
+from maxent_jax.errors import ConfigError
 from maxent_jax.features import make_feature_map
-from maxent_jax.runs import driver
-from maxent_jax.studies import paper_figures, protocol, raw, reproduced
+from maxent_jax.runs import files
+from maxent_jax.studies import paper_figures, protocol, results, values
 from maxent_jax.studies.protocol import Cell
 
 TOY = ["--scale", "toy", "--seeds", "1"]
@@ -71,11 +71,11 @@ def test_methods_that_are_compared_by_their_rewards_have_one_learner(name, scale
 
 @pytest.mark.parametrize("name", protocol.STUDIES)
 def test_all_methods_of_a_study_share_one_projection(name):
-    from maxent_jax import parts
+    from maxent_jax import components
 
     # The map has no other argument than the environment's name: no method, seed or setting.
     for cell in protocol.make(name, "toy"):
-        assert parts.make(cell.config).phi == make_feature_map(cell.config.env)
+        assert components.make(cell.config).phi == make_feature_map(cell.config.env)
 
 
 def test_fewer_seeds_are_a_part_of_the_study():
@@ -99,7 +99,7 @@ def test_fewer_seeds_are_a_part_of_the_study():
     ],
 )
 def test_bad_input_is_one_sentence_before_anything_is_written(tmp_path, argv, sentence):
-    with pytest.raises((cli.UsageError, ConfigError), match=sentence) as error:
+    with pytest.raises((errors.UsageError, ConfigError), match=sentence) as error:
         reproduce.main([*argv, "--out", str(tmp_path / "studies")])
     assert "\n" not in str(error.value)
     assert not (tmp_path / "studies").exists()
@@ -125,9 +125,9 @@ def test_a_directory_belongs_to_one_study_and_may_gain_seeds(tmp_path):
     assert set(held["cells"]) == {cell.name for cell in two}
 
     changed = [one[0]._replace(config=dataclasses.replace(one[0].config, eta=0.5))]
-    with pytest.raises(cli.UsageError, match=r"eta was 0\.1 and is 0\.5; choose another --out"):
+    with pytest.raises(errors.UsageError, match=r"eta was 0\.1 and is 0\.5; choose another --out"):
         protocol.claim(directory, "fig4", "cpu", changed)
-    with pytest.raises(cli.UsageError, match="scale is cpu, not paper"):
+    with pytest.raises(errors.UsageError, match="scale is cpu, not paper"):
         protocol.claim(directory, "fig4", "paper", protocol.make("fig4", "paper"))
     name = one[0].name
     before = {key: value for key, value in held["cells"][name].items() if key != "stale_rewards"}
@@ -136,31 +136,31 @@ def test_a_directory_belongs_to_one_study_and_may_gain_seeds(tmp_path):
     protocol.claim(directory, "fig4", "cpu", one)
     stale = [one[0]._replace(config=dataclasses.replace(one[0].config, stale_rewards=True))]
     (directory / protocol.STUDY).write_text(json.dumps(earlier))
-    with pytest.raises(cli.UsageError, match="stale_rewards was False and is True"):
+    with pytest.raises(errors.UsageError, match="stale_rewards was False and is True"):
         protocol.claim(directory, "fig4", "cpu", stale)
     (directory / protocol.STUDY).write_text(json.dumps(held | {"version": 0}))
-    with pytest.raises(cli.UsageError, match="version is 0, not 1"):
+    with pytest.raises(errors.UsageError, match="version is 0, not 1"):
         protocol.claim(directory, "fig4", "cpu", one)
     (directory / protocol.STUDY).write_text("{")
-    with pytest.raises(cli.UsageError, match="cannot be read"):
+    with pytest.raises(errors.UsageError, match="cannot be read"):
         protocol.claim(directory, "fig4", "cpu", one)
-    with pytest.raises(cli.UsageError, match="not empty"):
+    with pytest.raises(errors.UsageError, match="not empty"):
         protocol.claim(tmp_path, "fig4", "cpu", one)
 
 
 def test_processes_may_claim_a_directory_at_the_same_time(tmp_path):
-    parts = [protocol.make("fig4", "cpu", seeds) for seeds in (1, 2, 3, 4) * 4]
+    shares = [protocol.make("fig4", "cpu", seeds) for seeds in (1, 2, 3, 4) * 4]
     with ThreadPoolExecutor(16) as pool:
-        list(pool.map(lambda cells: protocol.claim(tmp_path / "s", "fig4", "cpu", cells), parts))
+        list(pool.map(lambda cells: protocol.claim(tmp_path / "s", "fig4", "cpu", cells), shares))
     held = json.loads((tmp_path / "s" / protocol.STUDY).read_text())
-    assert set(held["cells"]) == {cell.name for cell in parts[3]}
+    assert set(held["cells"]) == {cell.name for cell in shares[3]}
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """fig5 at toy size, which needs the runs of fig4, stopped once in the middle; and the calls."""
     out, trained = tmp_path_factory.mktemp("studies"), []
-    whole = driver.train
+    whole = train.run_to_end
 
     def until_the_second(config, directory, *rest):
         if len(trained) == 1:
@@ -174,10 +174,10 @@ def finished(tmp_path_factory):
 
     argv = ["fig5", *TOY, "--out", str(out)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(driver, "train", until_the_second)
+        patch.setattr(train, "run_to_end", until_the_second)
         with pytest.raises(KeyboardInterrupt):
             reproduce.main(argv)
-        patch.setattr(driver, "train", all_of_it)
+        patch.setattr(train, "run_to_end", all_of_it)
         reproduce.main(argv)
         reproduce.main(["fig4", *TOY, "--out", str(out)])
     return out, trained
@@ -191,7 +191,7 @@ def test_a_stopped_study_repeats_no_finished_cell(finished):
 def test_a_run_that_another_study_has_is_not_trained_again(finished, monkeypatch):
     out, _ = finished
     trained = []
-    monkeypatch.setattr(driver, "train", lambda config, directory, *_: trained.append(directory))
+    monkeypatch.setattr(train, "run_to_end", lambda config, at, *_: trained.append(at))
     for study in ("start", "weights", "refresh"):
         reproduce.main([study, *TOY, "--out", str(out), "--no-figures"])
     names = {directory.relative_to(out).as_posix() for directory in trained}
@@ -205,7 +205,7 @@ def test_a_run_that_another_study_has_is_not_trained_again(finished, monkeypatch
 
     uniform = protocol.make("weights", "toy", 1)[0]
     assert protocol.home(out / "weights", uniform) == out / "fig4" / "pendulum-V-0"
-    assert raw.read(out / "weights", [uniform])[0]["method"] == "uniform"
+    assert values.read(out / "weights", [uniform])[0]["method"] == "uniform"
     (out / "broken").mkdir()
     (out / "broken" / protocol.STUDY).write_text("{")
     assert protocol.home(out / "weights", uniform) == out / "fig4" / "pendulum-V-0"
@@ -222,7 +222,7 @@ def test_a_finished_run_with_other_settings_is_no_cell(finished, monkeypatch, ca
     content["config"]["eta"] = 0.5
     path.write_text(json.dumps(content))
     trained = []
-    monkeypatch.setattr(driver, "train", lambda config, directory, *_: trained.append(directory))
+    monkeypatch.setattr(train, "run_to_end", lambda config, at, *_: trained.append(at))
     with pytest.raises(SystemExit) as stop:
         reproduce.main(["fig4", *TOY, "--out", str(out)])
     path.write_text(kept)
@@ -235,12 +235,12 @@ def test_a_cell_that_cannot_be_trained_does_not_keep_the_others_from_it(
 ):
     trained = []
 
-    def train(config, directory, *_):
+    def fail_once(config, directory, *_):
         trained.append(directory.name)
         if len(trained) == 1:
-            raise runs.NonFiniteError("the loss is not finite.")
+            raise errors.NonFiniteError("the loss is not finite.")
 
-    monkeypatch.setattr(driver, "train", train)
+    monkeypatch.setattr(train, "run_to_end", fail_once)
     with pytest.raises(SystemExit) as stop:
         reproduce.main(["fig4", *TOY, "--out", str(tmp_path)])
     assert stop.value.code == 1
@@ -283,13 +283,13 @@ def test_environments_are_summarised_apart_and_never_confused():
 
     def columns(env, ahead):
         last = cells[env] + noise[env] + ahead
-        names = ("env_steps", *reproduced.SUMMARISED)
+        names = ("env_steps", *results.SUMMARISED)
         return {name: np.stack([last - 1, last], axis=1) for name in names}
 
     ahead = {"V": 100.0, "near": 0.0, "MEPOL": 0.0}
     order = [(env, m) for env in ("mountain_car", "pendulum") for m in ("V", "near")]
     order += [("pendulum", "MEPOL"), ("mountain_car", "MEPOL")]
-    found = reproduced.summarise([(env, m, columns(env, ahead[m])) for env, m in order])
+    found = results.summarise([(env, m, columns(env, ahead[m])) for env, m in order])
     for env, level in cells.items():
         table = found["last_iteration"][env]["mixture_coverage"]
         assert abs(table["near"]["interquartile_mean"] - level) < 1
@@ -307,18 +307,18 @@ def test_what_methods_differ_in_as_a_number_is_an_axis():
     for name, study in protocol.STUDIES.items():
         if study.along:
             cells = protocol.make(name, "cpu", 1)
-            found[name] = {c.method: reproduced.ALONG[study.along][1](c.config) for c in cells}
+            found[name] = {c.method: results.ALONG[study.along][1](c.config) for c in cells}
     iteration = protocol.make("refresh", "cpu", 1)[0].config.steps_per_iteration
     assert list(found) == ["refresh", "refresh_classic", "episodic"]
     assert list(found["refresh"].values()) == [64, 640, 6400, iteration]
     assert list(found["episodic"].values()) == [0, 0.01, 0.1, 1]
 
-    values = {"a": np.array([[0.0, 4.0], [0.0, 8.0]]), "b": np.array([[9.0, 1.0], [9.0, 3.0]])}
+    columns = {"a": np.array([[0.0, 4.0], [0.0, 8.0]]), "b": np.array([[9.0, 1.0], [9.0, 3.0]])}
     names = ("env_steps", *(name for name, _ in paper_figures.QUANTITIES))
-    values["c"] = values["b"] + 4  # placed where b is, as two periods of a short iteration
-    groups = [("ant", m, dict.fromkeys(names, column)) for m, column in values.items()]
+    columns["c"] = columns["b"] + 4  # placed where b is, as two periods of a short iteration
+    groups = [("ant", m, dict.fromkeys(names, column)) for m, column in columns.items()]
     of_random = {"env_steps": np.zeros((2, 1)), "cumulative_coverage": np.array([[5.0], [7.0]])}
-    groups.append(("ant", raw.RANDOM, of_random))
+    groups.append(("ant", values.RANDOM, of_random))
     places = {("ant", "a"): 10.0, ("ant", "b"): 0.0, ("ant", "c"): 0.0}
     figure = paper_figures.along(groups, places, "λ", "title")
     drawn = [[np.asarray(line.get_xydata()) for line in ax.get_lines()] for ax in figure.axes]
@@ -357,7 +357,7 @@ def test_the_raw_values_are_those_of_the_runs(finished):
     iterations = cells[0].config.num_iterations
     assert len(rows) == (len(cells) + 1) * iterations  # and the random policy
     for cell in cells:
-        kept = runs.read_metrics(out / "fig4" / cell.name)
+        kept = files.read_metrics(out / "fig4" / cell.name)
         own = [
             row
             for row in rows
@@ -366,7 +366,7 @@ def test_the_raw_values_are_those_of_the_runs(finished):
         for row, metrics in zip(own, kept, strict=True):
             assert float(row["mixture_entropy"]) == metrics["mixture_entropy"]
             assert int(row["cumulative_coverage"]) == metrics["cumulative_coverage"]
-    random = [row for row in rows if row["method"] == raw.RANDOM]
+    random = [row for row in rows if row["method"] == values.RANDOM]
     assert {row["gradient_steps"] for row in random} == {"0"}
 
 
@@ -374,10 +374,10 @@ def test_the_summary_is_of_the_last_iteration(finished):
     out, _ = finished
     summary = json.loads((out / "fig4" / "summary.json").read_text())
     assert summary["compared_with"] == "V"
-    assert summary["versions"] == [runs.stack()] and summary["all_environments"] == {}
+    assert summary["versions"] == [files.stack()] and summary["all_environments"] == {}
     for method in ("H", "LA", "V"):
         last = [
-            runs.read_metrics(out / "fig4" / cell.name)[-1]["cumulative_coverage"]
+            files.read_metrics(out / "fig4" / cell.name)[-1]["cumulative_coverage"]
             for cell in protocol.make("fig4", "toy", 1)
             if cell.method == method
         ]
@@ -392,34 +392,34 @@ def test_the_summary_is_of_the_last_iteration(finished):
 def test_cumulative_coverage_never_falls_in_any_run(finished):
     out, _ = finished
     for cell in protocol.make("fig4", "toy", 1):
-        rows = runs.read_metrics(out / "fig4" / cell.name)
+        rows = files.read_metrics(out / "fig4" / cell.name)
         coverage = [row["cumulative_coverage"] for row in rows]
         assert coverage == sorted(coverage) and coverage[0] > 0
 
 
 def test_seeds_side_by_side_are_told_apart(tmp_path):
     cell = Cell("V", preset("smoke", env="pendulum", seed=3, num_seeds=2))
-    row = {name: [1.0, 2.0] for name in raw.COLUMNS[3:]} | {"env_steps": 7}
-    row |= {f"random_{name}": [5, 6] for name in raw.MEASURED}
+    row = {name: [1.0, 2.0] for name in values.COLUMNS[3:]} | {"env_steps": 7}
+    row |= {f"random_{name}": [5, 6] for name in values.MEASURED}
     (tmp_path / cell.name).mkdir()
-    runs.append_metrics(tmp_path / cell.name, row)
-    found = raw.read(tmp_path, [cell])
+    files.append_metrics(tmp_path / cell.name, row)
+    found = values.read(tmp_path, [cell])
     assert [(r["seed"], r["method"], r["cumulative_coverage"]) for r in found] == [
         (3, "V", 1.0),
         (4, "V", 2.0),
-        (3, raw.RANDOM, 5),
-        (4, raw.RANDOM, 6),
+        (3, values.RANDOM, 5),
+        (4, values.RANDOM, 6),
     ]
 
 
 def test_an_entropy_that_json_cannot_hold_is_the_lowest_of_all(tmp_path):
     cell = Cell("V", preset("smoke", env="pendulum"))
-    row = dict.fromkeys(raw.COLUMNS[3:], 1.0) | {"mixture_knn_entropy": -np.inf}
+    row = dict.fromkeys(values.COLUMNS[3:], 1.0) | {"mixture_knn_entropy": -np.inf}
     (tmp_path / cell.name).mkdir()
-    runs.append_metrics(tmp_path / cell.name, row)
-    (found,) = raw.read(tmp_path, [cell])
+    files.append_metrics(tmp_path / cell.name, row)
+    (found,) = values.read(tmp_path, [cell])
     assert found["mixture_knn_entropy"] == -np.inf and found["mixture_entropy"] == 1
-    raw.write(tmp_path / "raw.csv", [found])
+    values.write(tmp_path / "raw.csv", [found])
     assert "-inf" in (tmp_path / "raw.csv").read_text()
 
 
@@ -449,43 +449,46 @@ def test_fig2_is_what_a_solver_of_quadratic_programs_finds(tmp_path):
 
 @pytest.mark.slow
 def test_mepol_has_the_env_steps_of_the_study_and_is_computed_once(tmp_path, monkeypatch):
-    from maxent_jax.studies import mepol_rows
+    from maxent_jax.studies import mepol_values
 
     config = preset("smoke", env="pendulum", num_seeds=2)
-    found = mepol_rows.rows(tmp_path, config, 2)
+    found = mepol_values.rows(tmp_path, config, 2)
     assert [(row["seed"], row["iteration"], row["env_steps"]) for row in found] == [
         (seed, i, i * config.steps_per_iteration) for i in (1, 2) for seed in (0, 1)
     ]
-    assert {row["method"] for row in found} == {mepol_rows.METHOD}
-    monkeypatch.setattr(mepol_rows, "_train", None)  # a second time would fail
-    assert mepol_rows.rows(tmp_path, config, 2) == found
+    assert {row["method"] for row in found} == {mepol_values.METHOD}
+    monkeypatch.setattr(mepol_values, "_train", None)  # a second time would fail
+    assert mepol_values.rows(tmp_path, config, 2) == found
     with pytest.raises(TypeError):
-        mepol_rows.rows(tmp_path, config, 1)
+        mepol_values.rows(tmp_path, config, 1)
 
 
 @pytest.mark.slow
 def test_the_weights_of_the_classic_environments_are_computed_once(tmp_path, monkeypatch):
-    from maxent_jax.studies import classic_weights
+    from maxent_jax.studies import hazan_weights
 
-    found = classic_weights.results(tmp_path, "toy", 1)
+    found = hazan_weights.results(tmp_path, "toy", 1)
     assert set(found) == {"pendulum", "mountain_car"}
     for of_env in found.values():
         assert list(of_env["weightings"]) == ["uniform", "η = 0.1", "η = 0.01", "η = 0.001"]
         runs_of = [np.array(values["fresh_entropy"]) for values in of_env["weightings"].values()]
         assert all(values.shape == (1, 3) and np.isfinite(values).all() for values in runs_of)
         np.testing.assert_array_equal(runs_of[0][:, 0], runs_of[1][:, 0])  # one policy, one weight
-    curves = classic_weights.curves(found)["pendulum"]
+    curves = hazan_weights.curves(found)["pendulum"]
     beside = found["pendulum"]["weightings"]["η = 0.1"]["random_fresh_entropy"]
-    assert curves["fresh_entropy"][raw.RANDOM].shape == (1, 3)  # the seeds once, not per weighting
-    np.testing.assert_allclose(curves["fresh_entropy"][raw.RANDOM], beside, rtol=1e-6)
-    table = classic_weights.table(found)
+    assert curves["fresh_entropy"][values.RANDOM].shape == (
+        1,
+        3,
+    )  # the seeds once, not per weighting
+    np.testing.assert_allclose(curves["fresh_entropy"][values.RANDOM], beside, rtol=1e-6)
+    table = hazan_weights.table(found)
     assert "probability_of_improvement" not in table["pendulum, fresh_entropy"]["uniform"]
     assert 0 <= table["pendulum, fresh_entropy"]["η = 0.1"]["probability_of_improvement"] <= 1
-    monkeypatch.setattr(classic_weights, "_run", None)
-    assert classic_weights.results(tmp_path, "toy", 1) == found
+    monkeypatch.setattr(hazan_weights, "_run", None)
+    assert hazan_weights.results(tmp_path, "toy", 1) == found
     for scale, seeds in (("cpu", 1), ("toy", 2)):  # what took minutes is not written over
-        with pytest.raises(cli.UsageError, match="choose another --out"):
-            classic_weights.results(tmp_path, scale, seeds)
-    (tmp_path / classic_weights.RESULTS).write_text("{")
-    with pytest.raises(cli.UsageError, match="cannot be read"):
-        classic_weights.results(tmp_path, "toy", 1)
+        with pytest.raises(errors.UsageError, match="choose another --out"):
+            hazan_weights.results(tmp_path, scale, seeds)
+    (tmp_path / hazan_weights.RESULTS).write_text("{")
+    with pytest.raises(errors.UsageError, match="cannot be read"):
+        hazan_weights.results(tmp_path, "toy", 1)

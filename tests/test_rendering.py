@@ -13,12 +13,13 @@ import untrained
 from PIL import Image
 
 import maxent_jax
-from maxent_jax import analysis, film, headless, parts, rendering, runs
+from maxent_jax import analysis, components, errors
 from maxent_jax.analysis import Paths
-from maxent_jax.commands import cli, render
+from maxent_jax.commands import render
 from maxent_jax.config import preset
-from maxent_jax.headless import RenderingError
-from maxent_jax.visual import video
+from maxent_jax.runs import files
+from maxent_jax.visual import frames, headless, rendering, video
+from maxent_jax.visual.headless import RenderingError
 
 ROOT = Path(__file__).parent.parent
 SIZE = 128
@@ -34,13 +35,13 @@ def opengl():
 
 @pytest.fixture(scope="module")
 def ant(opengl):
-    with rendering.scene(parts.make(preset("smoke")), SIZE) as scene:
+    with rendering.scene(components.make(preset("smoke")), SIZE) as scene:
         yield scene
 
 
 def rest(env="ant", **positions):
     """The state at rest, some of its positions changed: [D]."""
-    env = parts.make(preset("smoke", env=env)).env
+    env = components.make(preset("smoke", env=env)).env
     state = np.zeros(env.observation_size)
     state[: env.model.nq] = env.model.qpos0
     for name, value in positions.items():
@@ -84,7 +85,7 @@ def test_a_joint_moves_the_picture(ant):
 
 @pytest.mark.parametrize("env", ["walker2d", "humanoid"])
 def test_every_robot_is_seen(opengl, env):
-    with rendering.scene(parts.make(preset("smoke", env=env)), SIZE) as scene:
+    with rendering.scene(components.make(preset("smoke", env=env)), SIZE) as scene:
         state = rest(env)
         seen = scene.draw(state)
         state[0] += 1000.0
@@ -101,7 +102,7 @@ def test_an_environment_without_positions_is_refused():
             headless.check_drawable(env)
     headless.check_drawable("user:mine")
     with pytest.raises(RenderingError, match="'pendulum' cannot be drawn"):
-        rendering.scene(parts.make(preset("smoke", env="pendulum")), SIZE)
+        rendering.scene(components.make(preset("smoke", env="pendulum")), SIZE)
 
 
 @pytest.fixture
@@ -148,34 +149,34 @@ def untrained_run():
 
 @pytest.mark.slow
 def test_the_episode_of_median_length_is_shown():
-    (episode,) = film.median_episodes(untrained_run(), paths_of([5, 90, 7]))
+    (episode,) = frames.median_episodes(untrained_run(), paths_of([5, 90, 7]))
     assert episode.name == "π0" and episode.weight == 1
     np.testing.assert_array_equal(episode.route[:, 0], np.arange(7))
 
 
 def test_a_picture_after_the_end_is_the_last_state_faded(ant):
     run = untrained_run()
-    episodes = film.median_episodes(run, paths_of([60]))
-    shots = film.make(run, ant, episodes, speed=None)
+    episodes = frames.median_episodes(run, paths_of([60]))
+    shots = frames.make(run, ant, episodes, speed=None)
     assert shots.high[0] > 59 and shots.low[0] == -shots.high[0]  # the map holds all of it
-    early, last, after = (film.picture(shots, episodes[0], step) for step in (0, 59, 60))
+    early, last, after = (frames.picture(shots, episodes[0], step) for step in (0, 59, 60))
     assert difference(early, last) > 1
     assert after[SIZE // 2 :].mean() > last[SIZE // 2 :].mean() + 15
-    np.testing.assert_array_equal(after, film.picture(shots, episodes[0], 10_000))
+    np.testing.assert_array_equal(after, frames.picture(shots, episodes[0], 10_000))
 
 
 def test_a_mosaic_holds_its_pictures_in_rows():
     pictures = [np.full((6, 8, 3), value, np.uint8) for value in (10, 20, 30)]
-    sheet = film.mosaic(pictures, columns=2)
-    gap = film.GAP
+    sheet = frames.mosaic(pictures, columns=2)
+    gap = frames.GAP
     assert sheet.shape == (12 + gap, 16 + gap, 3)
     assert (sheet[:6, :8] == 10).all() and (sheet[:6, 8 + gap :] == 20).all()
     assert (sheet[6 + gap :, :8] == 30).all() and (sheet[6 + gap :, 8 + gap :] == 255).all()
 
 
 def test_stills_run_from_the_first_step_to_the_last():
-    assert film.stills(1001, 5) == [0, 250, 500, 750, 1000]
-    assert film.stills(1, 3) == [0, 0, 0]
+    assert frames.stills(1001, 5) == [0, 250, 500, 750, 1000]
+    assert frames.stills(1, 3) == [0, 0, 0]
 
 
 @pytest.mark.slow
@@ -197,7 +198,7 @@ def test_a_run_is_filmed(opengl, copy_of_smoke_run, capsys):
         assert seconds == pytest.approx(frames / 20, abs=0.051)
     frames, _ = imageio_ffmpeg.count_frames_and_secs(videos / "mixture.mp4")
     assert frames == -(-lengths.max() // 4)
-    half, gap = SIZE // 2, film.GAP
+    half, gap = SIZE // 2, frames.GAP
     assert size_of(videos / "policy_1.png") == (3 * half + 2 * gap, half)
     assert size_of(videos / "mixture.png") == (3 * half + 2 * gap, 3 * half + 2 * gap)
 
@@ -226,7 +227,7 @@ def test_a_video_that_cannot_be_written_leaves_nothing(tmp_path):
 
 def test_without_ffmpeg_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(cli.UsageError, match=r'pip install "maxent_jax\[render\]"'):
+    with pytest.raises(errors.UsageError, match=r'pip install "maxent_jax\[render\]"'):
         video.check()
 
 
@@ -246,7 +247,7 @@ def test_without_ffmpeg_the_extra_is_named(monkeypatch):
     ],
 )
 def test_a_mistake_is_one_sentence_at_once(tmp_path, env, arguments, words):
-    runs.write_config(tmp_path, preset("smoke", env=env), {}, {})
+    files.write_config(tmp_path, preset("smoke", env=env), {}, {})
     assert words in refused(tmp_path, *arguments)
 
 
@@ -255,7 +256,7 @@ def test_a_missing_directory_is_named(tmp_path):
 
 
 def test_a_backend_that_does_not_draw_is_named(tmp_path, monkeypatch):
-    runs.write_config(tmp_path, preset("smoke"), {}, {})
+    files.write_config(tmp_path, preset("smoke"), {}, {})
     monkeypatch.setenv("MUJOCO_GL", "osmessa")
     assert "MUJOCO_GL is 'osmessa'" in refused(tmp_path)
 
@@ -273,8 +274,8 @@ def refused(*arguments):
 
 def test_an_unfinished_run_has_fewer_policies_than_planned(opengl, tmp_path, monkeypatch):
     run = untrained_run()
-    runs.write_config(tmp_path, run.config, {}, {})
+    files.write_config(tmp_path, run.config, {}, {})
     (tmp_path / "checkpoints" / "1").mkdir(parents=True)
     monkeypatch.setattr(analysis, "load_run", lambda *_: run)
-    with pytest.raises(cli.UsageError, match="policies 0 to 0"):
+    with pytest.raises(errors.UsageError, match="policies 0 to 0"):
         render.main([str(tmp_path), "--policy", "1"])

@@ -15,10 +15,10 @@ import pytest
 import untrained
 from PIL import Image
 
-from maxent_jax import plotting, runs
 from maxent_jax.commands import report
 from maxent_jax.config import preset
-from maxent_jax.visual import tables
+from maxent_jax.runs import files
+from maxent_jax.visual import plotting, tables
 
 ROOT = Path(__file__).parent.parent
 NAME = '<script>alert(1)<b>&amp;"$x_{'  # markup, and mathematics that does not end
@@ -86,7 +86,7 @@ def test_its_pictures_load_nothing_either(page):
 
 
 def test_the_page_holds_the_metrics_of_every_seed(page, directory):
-    last = runs.read_metrics(directory)[-1]
+    last = files.read_metrics(directory)[-1]
     for seed in range(2):
         for name in ("cumulative_coverage", "mixture_coverage", "random_coverage"):
             assert f"{last[name][seed]:,}" in page.text
@@ -98,7 +98,7 @@ def test_the_page_holds_the_metrics_of_every_seed(page, directory):
 
 
 def test_every_setting_and_every_departure_is_there(page, directory):
-    config = runs.read_config(directory)
+    config = files.read_config(directory)
     for name, value in dataclasses.asdict(config).items():
         assert re.search(rf"\b{name}\s*{re.escape(str(value))}", page.text), name
     for why in config.deviations().values():
@@ -150,7 +150,7 @@ def test_a_run_without_a_complete_iteration_has_a_page():
 def test_a_config_file_of_anothers_making_breaks_nothing(tmp_path):
     run = dataclasses.replace(untrained.make_run(num_iterations=1), path=tmp_path)
     content = {"machine": {"device": ["cpu"]}, "versions": ["jax"], "budget": "none"}
-    (tmp_path / runs.CONFIG).write_text(json.dumps(content))
+    (tmp_path / files.CONFIG).write_text(json.dumps(content))
     section = report._run_section("run", [run])
     assert section["machine"].rows == [["device", "['cpu']"]]
     assert section["versions"].rows == []
@@ -189,7 +189,7 @@ def test_the_comparison_draws_every_seed_in_its_runs_colour():
     ],
 )
 def test_a_mistake_is_one_sentence_at_once(tmp_path, arguments, words):
-    runs.write_config(tmp_path, preset("smoke"), {}, {})
+    files.write_config(tmp_path, preset("smoke"), {}, {})
     line = [argument.format(run=tmp_path) for argument in arguments]
     started = time.monotonic()
     done = subprocess.run(

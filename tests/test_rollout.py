@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from brax.envs.base import Env, State
 
-from maxent_jax import mixture, occupancy, parts, rollout
+from maxent_jax import components, mixture, rollout
+from maxent_jax.components import Components
 from maxent_jax.config import preset
 from maxent_jax.density import histogram
 from maxent_jax.envs import base
-from maxent_jax.occupancy import Occupancy, Scores
-from maxent_jax.parts import Parts
+from maxent_jax.mixture import occupancy
+from maxent_jax.mixture.occupancy import Occupancy, Scores
 from maxent_jax.sac import agent
 
 T = 6
@@ -92,7 +93,7 @@ def test_the_policy_sees_the_state_and_a_new_key_each_step():
 
 
 def make_parts(**changes):
-    return parts.make(preset("smoke", **changes))
+    return components.make(preset("smoke", **changes))
 
 
 def make_archive(p, size):
@@ -301,7 +302,7 @@ def test_scores_are_those_by_hand(key, leave_own_out, source, num_policies, snap
     if source == "history":  # points that no state of these rollouts is
         points, rows = points + 0.1, jnp.full_like(rows, -1)
     scores = occupancy.score(
-        Parts(config, *[None] * 6), found, points, rows, archive_of(num_policies)
+        Components(config, *[None] * 6), found, points, rows, archive_of(num_policies)
     )
     expected = expected_scores(found, points, rows, config, num_policies)
     # Sums of up to 60 float32 rewards of order 1.
@@ -317,7 +318,7 @@ def test_a_parked_policy_scores_low_only_among_its_own_states():
     rows = jnp.arange(NUM_STATES, dtype=jnp.int32)
     best = {}
     for leave_own_out in (False, True):
-        p = Parts(preset("smoke", leave_own_out=leave_own_out), *[None] * 6)
+        p = Components(preset("smoke", leave_own_out=leave_own_out), *[None] * 6)
         scores = occupancy.score(p, found, found.features, rows, archive_of(2))
         best[leave_own_out] = int(occupancy.best(scores, found))
         if not leave_own_out:
@@ -335,7 +336,7 @@ def test_a_policy_that_made_the_whole_reference_sees_its_own_states(key):
         assert (found.policy[seen] != 2).sum() == num_foreign
         scores = {
             leave_own_out: occupancy.score(
-                Parts(preset("smoke", leave_own_out=leave_own_out), *[None] * 6),
+                Components(preset("smoke", leave_own_out=leave_own_out), *[None] * 6),
                 found,
                 found.features[seen],
                 seen,
@@ -353,7 +354,7 @@ def test_a_policy_without_weight_is_scored_all_the_same(key):
     # As MaxEnt-H weighs its older policies: they play, and the mixture does without them.
     found = hand_made(key)
     weightless = found._replace(weight=jnp.where(found.policy == 0, 0.0, found.weight))
-    p = Parts(preset("smoke"), *[None] * 6)
+    p = Components(preset("smoke"), *[None] * 6)
     rows = jnp.arange(NUM_STATES, dtype=jnp.int32)
     scores = [
         occupancy.score(p, each, found.features, rows, archive_of(3))

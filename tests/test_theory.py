@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from maxent_jax import methods, mixture
-from maxent_jax.commands import cli, theory
+from maxent_jax import errors, mixture
+from maxent_jax.algorithm import methods
+from maxent_jax.commands import theory
 from maxent_jax.theory import bounds, loop, mdps, optimum, peers, reference, tabular
 from maxent_jax.theory.loop import Settings
 
@@ -343,7 +344,7 @@ def test_the_entry_point_at_toy_size(tmp_path, capsys):
     ],
 )
 def test_bad_flags_are_one_sentence(flags, sentence):
-    with pytest.raises(cli.UsageError, match=sentence.replace(".", r"\.")):
+    with pytest.raises(errors.UsageError, match=sentence.replace(".", r"\.")):
         theory.main(flags)
 
 
@@ -353,7 +354,7 @@ def test_an_mdp_of_ones_own_is_checked_before_anything_is_computed(tmp_path, row
     transitions[1, 1] = row
     np.savez(tmp_path / "own.npz", transitions=transitions, start=np.eye(3)[0])
     with pytest.raises(
-        cli.UsageError, match="a row of transitions must be 0 or more and sum to one"
+        errors.UsageError, match="a row of transitions must be 0 or more and sum to one"
     ):
         theory.main(["--mdp", str(tmp_path / "own.npz"), "--out", str(tmp_path / "theory.json")])
     assert not (tmp_path / "theory.json").exists()

@@ -16,10 +16,10 @@ from commands import ROOT, call, in_subprocess
 
 import maxent_jax
 from benchmarks import common, gpu
-from maxent_jax import envs, integrity, runs
+from maxent_jax import envs, errors
 from maxent_jax.commands import train
 from maxent_jax.config import preset
-from maxent_jax.runs import driver
+from maxent_jax.runs import driver, files, integrity
 
 NO_RENDERING = Path(__file__).parent / "no_rendering"
 TINY = ("--preset", "smoke", "--num-segments", "1", "--mixture-episodes", "6")
@@ -57,7 +57,7 @@ def test_a_run_leaves_its_files(finished):
 
 
 def test_metrics_hold_one_line_an_iteration_and_mark_the_clock(finished):
-    rows = runs.read_metrics(finished)
+    rows = files.read_metrics(finished)
     assert [row["iteration"] for row in rows] == [1, 2]
     assert [row["env_steps"] for row in rows] == [400, 800]
     assert all(0 < row["wall_begin"] < row["wall_seconds"] for row in rows)
@@ -118,21 +118,21 @@ def test_a_run_can_be_looked_at_with_any_number_of_episodes(finished):
 @pytest.mark.slow
 def test_resume_without_a_checkpoint_starts_over(tmp_path):
     config = preset("smoke")
-    runs.write_config(tmp_path, config, {}, {})
+    files.write_config(tmp_path, config, {}, {})
     (tmp_path / "metrics.jsonl").write_text('{"iteration": 1}\n{"itera')
     resumed = train.read_arguments(["--preset", "smoke", "--out", str(tmp_path), "--resume"])
     with train.claimed(resumed):
         driver.train(resumed.config, resumed.directory, time.perf_counter())
-    assert [row["env_steps"] for row in runs.read_metrics(tmp_path)] == [400, 800]
+    assert [row["env_steps"] for row in files.read_metrics(tmp_path)] == [400, 800]
 
 
 def test_several_seeds_train_side_by_side(two_seeds):
-    rows = runs.read_metrics(two_seeds)
+    rows = files.read_metrics(two_seeds)
     assert [row["env_steps"] for row in rows] == [[400, 400], [800, 800]]
     loaded = [maxent_jax.load_run(two_seeds, seed_index=i) for i in range(2)]
     assert [run.histogram.sum() for run in loaded] == [800, 800]
     assert not np.array_equal(loaded[0].histogram, loaded[1].histogram)
-    with pytest.raises(runs.RunError, match="2 seeds"):
+    with pytest.raises(errors.RunError, match="2 seeds"):
         maxent_jax.load_run(two_seeds, seed_index=2)
 
 
@@ -152,14 +152,14 @@ def test_every_method_runs_on_both_backends(tmp_path, backend, method, period):
         num_iterations=num_iterations,
     )
     driver.train(config, tmp_path, time.perf_counter())  # in this process: compiled once
-    assert [row["env_steps"] for row in runs.read_metrics(tmp_path)] == [400, 800][:num_iterations]
+    assert [row["env_steps"] for row in files.read_metrics(tmp_path)] == [400, 800][:num_iterations]
 
 
 def run_smoke(directory, env, backend, **changes):
     config = preset("smoke", env=env, backend=backend, num_iterations=1, **changes)
     with jax.numpy_rank_promotion("allow"), jax.legacy_prng_key("allow"):  # for brax
         driver.train(config, directory, time.perf_counter())
-    (row,) = runs.read_metrics(directory)
+    (row,) = files.read_metrics(directory)
     assert row["env_steps"] == 400 and row["num_invalid"] == 0
     assert maxent_jax.load_run(directory).histogram.sum() <= 400
     assert (directory / "figures" / "fireworks.png").exists()
@@ -226,12 +226,12 @@ def test_resume_with_other_settings_names_them(finished):
         lambda d: (d / "config.json").write_text("{"),
         lambda d: (d / "config.json").write_text('{"schema": 99, "config": {}}'),
         lambda d: (d / "config.json").write_text(
-            json.dumps({"schema": runs.SCHEMA, "config": {"no_such": 1}})
+            json.dumps({"schema": files.SCHEMA, "config": {"no_such": 1}})
         ),
     ],
 )
 def test_evaluate_refuses_a_directory_that_is_no_run(tmp_path, damage):
-    runs.write_config(tmp_path, preset("smoke"), {}, {})
+    files.write_config(tmp_path, preset("smoke"), {}, {})
     damage(tmp_path)
     done = call("evaluate", tmp_path, expect=2)
     assert done.stderr.count("\n") == 1 and str(tmp_path) in done.stderr
@@ -261,7 +261,7 @@ def test_a_run_resumes_with_its_own_settings_and_is_overwritten_on_demand(finish
     (directory / "mine.txt").write_text("kept")
     assert "complete" in call("train", "--out", directory, "--resume").stdout
     call("train", *TINY, "--num-iterations", 1, "--out", directory, "--overwrite")
-    assert len(runs.read_metrics(directory)) == 1
+    assert len(files.read_metrics(directory)) == 1
     assert (directory / "mine.txt").read_text() == "kept"
 
 
@@ -287,7 +287,7 @@ def test_a_directory_that_cannot_be_made_is_refused(tmp_path):
 
 
 def test_evaluate_says_when_there_is_no_checkpoint(tmp_path):
-    runs.write_config(tmp_path, preset("smoke"), {}, {})
+    files.write_config(tmp_path, preset("smoke"), {}, {})
     assert "no complete checkpoint" in call("evaluate", tmp_path, expect=2).stderr
 
 
@@ -360,7 +360,7 @@ def test_an_iteration_ends_at_a_plateau(tmp_path):
         plateau_tolerance=1.0,  # any segment after the lowest
     )
     driver.train(config, tmp_path, time.perf_counter())
-    (row,) = runs.read_metrics(tmp_path)
+    (row,) = files.read_metrics(tmp_path)
     taken = row["segments_trained"]
     assert row["converged"] and 2 <= taken < 10
     assert row["env_steps"] == 40 * taken
@@ -385,7 +385,7 @@ def test_the_cache_folder_is_the_users_own(monkeypatch):
     environment = os.environ | {"XDG_CACHE_HOME": "elsewhere"}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     code = (
-        "import jax; from maxent_jax import runtime; runtime.prepare(False);"
+        "import jax; from maxent_jax.runs import runtime; runtime.prepare(False);"
         "print(jax.config.jax_compilation_cache_dir)"
     )
     done = subprocess.run(

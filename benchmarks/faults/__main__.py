@@ -11,7 +11,7 @@ from pathlib import Path
 
 from benchmarks import common
 from benchmarks.faults import api, crowd, damage, disk, environment, inputs, numbers, saves, stops
-from maxent_jax import runtime
+from maxent_jax.runs import runtime
 
 PARTS = {
     "inputs": inputs,

@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import common
-from maxent_jax import envs, features, load_run, mixture, parts, rewards, runs
+from maxent_jax import components, envs, features, load_run, mixture, rewards
 from maxent_jax.analysis import Paths, Run
-from maxent_jax.choices import ConfigError, ConfigTypeError
 from maxent_jax.config import Config, preset
 from maxent_jax.density import entropy, histogram, knn
 from maxent_jax.density.histogram import Grid
-from maxent_jax.runs import CheckpointError, RunError
+from maxent_jax.errors import CheckpointError, ConfigError, ConfigTypeError, RunError
+from maxent_jax.runs import files
 from maxent_jax.sac import agent
 from maxent_jax.theory import bounds
 
@@ -51,7 +51,7 @@ def places(folder: Path) -> Places:
     """Made in that folder."""
     begun = folder / "begun"
     begun.mkdir()
-    runs.write_config(begun, preset("smoke"), {}, {})
+    files.write_config(begun, preset("smoke"), {}, {})
     (folder / "broken.xml").write_text("<mujoco><nonsense/></mujoco>", encoding="utf-8")
     mesh = "<asset><mesh name='a' file='none.obj'/></asset>"
     geom = "<worldbody><geom type='mesh' mesh='a'/></worldbody>"
@@ -59,14 +59,14 @@ def places(folder: Path) -> Places:
     newer = folder / "newer"
     newer.mkdir()
     content = json.dumps({"schema": 99, "config": {}})
-    (newer / runs.CONFIG).write_text(content, encoding="utf-8")
+    (newer / files.CONFIG).write_text(content, encoding="utf-8")
     config = preset("smoke", env="pendulum", num_iterations=1)
-    sac = parts.make(config).sac
+    sac = components.make(config).sac
     agents = [agent.init(sac, key).parameters for key in jax.random.split(jax.random.key(0))]
     archive = mixture.init(agents[0], config.archive_size)
     for parameters in agents:
         archive = mixture.append(archive, parameters)
-    none = np.zeros(parts.make(config).grid.bins, np.int32)
+    none = np.zeros(components.make(config).grid.bins, np.int32)
     return Places(folder, begun, Run(folder, config, {}, config.seed, archive, none, none))
 
 

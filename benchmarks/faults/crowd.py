@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.faults import smoke
-from maxent_jax import runs
+from maxent_jax.runs import files
 
 
 def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
@@ -33,7 +33,7 @@ def _race(directory: Path) -> dict[str, Any]:
     runners.sort(key=lambda runner: runner.poll() is None)
     loser, winner = runners
     said = loser.communicate()[1].strip().replace(str(directory), "DIR")
-    while not (directory / runs.CONFIG).exists() and winner.poll() is None:
+    while not (directory / files.CONFIG).exists() and winner.poll() is None:
         time.sleep(0.01)
     one_ran = winner.poll() is None and loser.returncode == 2
     os.kill(winner.pid, signal.SIGKILL)

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.faults import smoke
-from maxent_jax import checkpoint, integrity, load_run, runs
-from maxent_jax.integrity import ARRAYS, FOLDER, MANIFEST, REPLAY
+from maxent_jax import errors, load_run
+from maxent_jax.runs import checkpoint, files, integrity
+from maxent_jax.runs.integrity import ARRAYS, FOLDER, MANIFEST, REPLAY
 
 NUM_FLIPS = 200
 
@@ -56,16 +57,16 @@ def _damage(run: Path, path: Path, do: Callable[[Path], Any]) -> dict[str, bool]
     silently, named = True, False
     try:
         integrity.find(run)
-    except runs.CheckpointCorruptError as error:
+    except errors.CheckpointCorruptError as error:
         silently, named = False, name in str(error)
     if not name.startswith(REPLAY):  # analysis reads all but the replay
         try:
             load_run(run)
             silently = True
-        except runs.CheckpointCorruptError:
+        except errors.CheckpointCorruptError:
             pass
     fallback, passed_over = integrity.find(run, fallback=True)
-    checkpoint.restore(run, fallback, runs.read_config(run))
+    checkpoint.restore(run, fallback, files.read_config(run))
     path.write_bytes(before)
     return {
         "loaded silently": silently,
@@ -124,7 +125,7 @@ def _foreign(run: Path, latest: Path) -> Iterator[dict[str, Any]]:
         try:
             integrity.find(run)
             refused = ""
-        except runs.CheckpointCorruptError as error:
+        except errors.CheckpointCorruptError as error:
             refused = str(error).split("damaged: ")[1].split(";")[0]
         shutil.rmtree(run)
         shutil.rmtree(run.parent / "folder", ignore_errors=True)

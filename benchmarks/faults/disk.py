@@ -13,15 +13,16 @@ from typing import Any
 from unittest import mock
 
 from benchmarks.faults import smoke
-from maxent_jax import checkpoint, integrity, plotting, runs
 from maxent_jax.commands import train
-from maxent_jax.runs import SaveError, driver
+from maxent_jax.errors import SaveError
+from maxent_jax.runs import checkpoint, driver, files, integrity
+from maxent_jax.visual import plotting
 
 MEGABYTES = 16
 # Whose writing meets the full disk, and the most bytes that are left for it.
 WRITERS: tuple[tuple[str, Any, str, int], ...] = (
     ("checkpoint", checkpoint, "save", 200_000),
-    ("log", runs, "append_metrics", 0),
+    ("log", files, "append_metrics", 0),
     ("figure", plotting, "save", 50_000),
 )
 

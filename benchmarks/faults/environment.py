@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 
 from benchmarks import common
 from benchmarks.faults import smoke
-from maxent_jax import runs
 from maxent_jax.config import preset
-from maxent_jax.runs import locks
+from maxent_jax.runs import files, locks
 
 COMMAND = '"$@"'
 UNLIMITED_SECONDS = 600
@@ -202,11 +201,11 @@ def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
     """A row for each group; what was not met as it should be is in it."""
     places = _places(folder)
     if short:  # no run is trained
-        runs.write_config(places["run"], preset("smoke", env="pendulum"), {}, {})
+        files.write_config(places["run"], preset("smoke", env="pendulum"), {}, {})
     else:
         for name in ("run", "undisturbed"):
             smoke.train_pendulum(places[name])
-        shutil.copy(places["run"] / runs.CONFIG, places["begun"])
+        shutil.copy(places["run"] / files.CONFIG, places["begun"])
     for name, faults in GROUPS.items():
         chosen = [f for f in faults if _is_cheap(f)][:1] if short else faults
         wrong = []
@@ -241,10 +240,10 @@ def _places(folder: Path) -> dict[str, Path]:
     places["link"].symlink_to("target")
     places["dangling"].symlink_to("nowhere")
     (places["begun"] / "checkpoints" / "unfinished-0+1").mkdir(parents=True)  # of a killed run
-    for name in (runs.METRICS, locks.LOCK):
+    for name in (files.METRICS, locks.LOCK):
         (places["begun"] / name).write_text("", encoding="utf-8")
     places["foreign"].mkdir()
-    (places["foreign"] / runs.CONFIG).write_text('{"model": "mine"}', encoding="utf-8")
+    (places["foreign"] / files.CONFIG).write_text('{"model": "mine"}', encoding="utf-8")
     (places["logs"] / "tensorboard").mkdir(parents=True)
     return places
 

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from maxent_jax import integrity, runs
 from maxent_jax.config import preset
+from maxent_jax.runs import files, integrity
 
 SECONDS = 3.0
 
@@ -141,12 +141,12 @@ def _places(folder: Path) -> dict[str, Path]:
     for name in names[1:]:
         places[name].mkdir()
     (places["foreign"] / "thesis.tex").write_text("", encoding="utf-8")
-    (places["newer"] / runs.CONFIG).write_text(
+    (places["newer"] / files.CONFIG).write_text(
         json.dumps({"schema": 99, "config": {}}), encoding="utf-8"
     )
-    runs.write_config(places["begun"], preset("smoke"), {}, {})
-    runs.write_config(places["run"], preset("smoke"), {}, {})
-    runs.write_config(places["pendulum"], preset("smoke", env="pendulum"), {}, {})
+    files.write_config(places["begun"], preset("smoke"), {}, {})
+    files.write_config(places["run"], preset("smoke"), {}, {})
+    files.write_config(places["pendulum"], preset("smoke", env="pendulum"), {}, {})
     for name in ("run", "pendulum"):
         (places[name] / integrity.FOLDER / "2").mkdir(parents=True)  # saved, by its name
     places["file"] = folder / "file"

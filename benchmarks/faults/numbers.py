@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from maxent_jax import checkpoint, envs, integrity, runs
+from maxent_jax import envs
 from maxent_jax.config import preset
 from maxent_jax.envs.pendulum import Pendulum
-from maxent_jax.runs import NonFiniteError, driver
+from maxent_jax.errors import NonFiniteError
+from maxent_jax.runs import checkpoint, driver, files, integrity
 
 
 class Faulty(Pendulum):
@@ -32,7 +33,7 @@ def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
     envs.register("faulty", lambda backend, physics: Faulty())
     directory = folder / "observation"
     error = _train(directory, env="user:faulty")
-    counted = sum(row["num_invalid"] for row in runs.read_metrics(directory))
+    counted = sum(row["num_invalid"] for row in files.read_metrics(directory))
     yield {
         "fault": "nan in an observation",
         "times": 1,
@@ -67,7 +68,7 @@ def _train(directory: Path, **changes: Any) -> str:
 
 def _num_not_finite(directory: Path) -> int:
     """In all checkpoints, and in all but the missing values of the metrics."""
-    config, found = runs.read_config(directory), 0
+    config, found = files.read_config(directory), 0
     for name in integrity.checkpoints(directory):
         state = checkpoint.restore(directory, name, config)
         for leaf in jax.tree.leaves(state._replace(key=state.iteration)):

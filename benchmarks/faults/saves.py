@@ -5,9 +5,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from maxent_jax import algorithm, checkpoint, runs
-from maxent_jax.checkpoint import Progress
+from maxent_jax import algorithm
 from maxent_jax.config import preset
+from maxent_jax.runs import checkpoint, files
+from maxent_jax.runs.checkpoint import Progress
 
 NUM_SAVES = 300
 SETTLED = 50  # saves after which nothing may grow
@@ -19,7 +20,7 @@ def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
     num_saves = 20 if short else NUM_SAVES
     config = preset("smoke", env="pendulum")
     state = algorithm.start(config)
-    runs.write_config(folder, config, {}, {})
+    files.write_config(folder, config, {}, {})
     progress = Progress([], {}, [], {})
     used = []
     for i in range(num_saves):

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from maxent_jax import checkpoint, integrity, runs
+from maxent_jax.runs import checkpoint, files, integrity
 
 # Saved at every boundary, so that a fault may meet a checkpoint as well as the work between two.
 SMOKE = ("--preset", "smoke", "--save-minutes", "1e-9")
@@ -51,7 +51,7 @@ def same(one: Path, other: Path) -> bool:
     """Whether two runs ended alike: states, metrics but for the clock, and no figure missing."""
     states = [_state(directory) for directory in (one, other)]
     equal_bits = jax.tree.map(lambda a, b: a.tobytes() == b.tobytes(), *states)
-    figures = [sorted(p.name for p in (d / runs.FIGURES).iterdir()) for d in (one, other)]
+    figures = [sorted(p.name for p in (d / files.FIGURES).iterdir()) for d in (one, other)]
     return (
         all(jax.tree.leaves(equal_bits))
         and timeless(one) == timeless(other)
@@ -61,13 +61,13 @@ def same(one: Path, other: Path) -> bool:
 
 def timeless(directory: Path) -> list[dict[str, Any]]:
     """The lines of metrics.jsonl without what the clock has a part in."""
-    lines = (directory / runs.METRICS).read_text(encoding="utf-8").splitlines()
-    assert len(lines) == len(runs.read_metrics(directory)), "an unfinished line"
-    rows = runs.read_metrics(directory)
+    lines = (directory / files.METRICS).read_text(encoding="utf-8").splitlines()
+    assert len(lines) == len(files.read_metrics(directory)), "an unfinished line"
+    rows = files.read_metrics(directory)
     return [{k: v for k, v in row.items() if not k.startswith("wall_")} for row in rows]
 
 
 def _state(directory: Path) -> Any:
     name, _ = integrity.find(directory)
-    state = checkpoint.restore(directory, name, runs.read_config(directory))
+    state = checkpoint.restore(directory, name, files.read_config(directory))
     return jax.tree.map(np.asarray, state._replace(key=jax.random.key_data(state.key)))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.faults import smoke
-from maxent_jax import integrity
+from maxent_jax.runs import integrity
 
 
 def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:

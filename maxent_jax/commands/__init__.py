@@ -13,8 +13,9 @@ def main() -> None:
 
 def _dispatch(argv: Sequence[str]) -> None:
     from maxent_jax import __version__
-    from maxent_jax.choices import UsageError, check_choice
+    from maxent_jax.checks import check_choice
     from maxent_jax.commands import cli
+    from maxent_jax.errors import UsageError
 
     known = cli.COMMANDS
     if not argv:

@@ -16,11 +16,10 @@ from typing import Any, TypeVar
 
 import tyro
 
-from maxent_jax.choices import ConfigError, UsageError
 from maxent_jax.commands import streams
 from maxent_jax.commands.streams import OutputError
-from maxent_jax.runs import NonFiniteError, RunError, SaveError
-from maxent_jax.runs.interruption import Interrupted
+from maxent_jax.errors import ConfigError, NonFiniteError, RunError, SaveError, UsageError
+from maxent_jax.runs.signals import Interrupted
 
 NARROWEST = 40  # columns
 Arguments = TypeVar("Arguments")

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from maxent_jax import headless, integrity, runs, runtime
+from maxent_jax import errors
 from maxent_jax.commands import cli
+from maxent_jax.runs import files, integrity, runtime
+from maxent_jax.visual import headless
 
 if TYPE_CHECKING:
     from maxent_jax.analysis import Run
@@ -40,18 +42,18 @@ def main(argv: Sequence[str]) -> None:
     """Parses and checks, and only then loads jax."""
     arguments = cli.parse(Arguments, argv, "evaluate")
     if arguments.episodes < 1 or arguments.seed < 0:
-        raise cli.UsageError("--episodes must be at least 1, and --seed 0 or more.")
-    config = runs.read_config(arguments.directory)
+        raise errors.UsageError("--episodes must be at least 1, and --seed 0 or more.")
+    config = files.read_config(arguments.directory)
     integrity.check_any(arguments.directory)
-    runs.check_writable(arguments.directory)
+    files.check_writable(arguments.directory)
     headless.draw_nothing()
     runtime.start(config.simulates_in_jax)
     if arguments.gymnasium:
-        from maxent_jax import gymnasium_play
+        from maxent_jax.analysis import gymnasium_play
 
         gymnasium_play.make(config).close()  # what is wrong is said before anything is rolled out
     report = evaluate(arguments)
-    runs.write_json(arguments.directory / "evaluation.json", report)
+    files.write_json(arguments.directory / "evaluation.json", report)
     _print(report)
 
 
@@ -60,12 +62,13 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
     import jax.numpy as jnp
     import numpy as np
 
-    from maxent_jax import analysis, plotting
+    from maxent_jax import analysis
     from maxent_jax.density import histogram
+    from maxent_jax.visual import plotting
 
     run = analysis.load_run(arguments.directory, arguments.seed_index, arguments.fallback)
     visited = run.occupancy(arguments.episodes, arguments.seed)
-    cells = histogram.count(visited.states, run.parts.grid, visited.weight)
+    cells = histogram.count(visited.states, run.components.grid, visited.weight)
     plotting.save_all(run, np.asarray(cells), analysis.paths(visited))
     return {
         "run": str(run.path),
@@ -73,7 +76,7 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
         "episodes_per_policy": arguments.episodes,
         "rollout_seed": arguments.seed,
         "reward": run.config.reward,
-        "coordinates": run.parts.grid.names,
+        "coordinates": run.components.grid.names,
         "deviations_from_the_paper": run.config.deviations(),
         "policies": [s._asdict() for s in run.summaries(visited, arguments.seed)],
         "training_coverage": int((run.histogram > 0).sum()),
@@ -89,7 +92,7 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
 
 
 def _gap(run: "Run", arguments: Arguments) -> dict[str, Any]:
-    from maxent_jax import gymnasium_play
+    from maxent_jax.analysis import gymnasium_play
 
     measured = gymnasium_play.gap(run, arguments.episodes, arguments.seed)
     return {

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from maxent_jax import headless, integrity, runs, runtime
+from maxent_jax import errors
 from maxent_jax.commands import cli
-from maxent_jax.runs import display
-from maxent_jax.visual import video
+from maxent_jax.runs import files, integrity, progress, runtime
+from maxent_jax.visual import headless, video
 
 if TYPE_CHECKING:
     from maxent_jax.analysis import Run
-    from maxent_jax.film import Episode, Film
+    from maxent_jax.visual.frames import Episode, Film
 
 FRAMES_PER_SECOND = 20  # about; fewer where a step of the environment lasts longer
 VIDEO_SECONDS = 25
@@ -56,13 +56,13 @@ class Arguments:
 def main(argv: Sequence[str]) -> None:
     """Parses and checks, and only then loads jax and MuJoCo."""
     arguments = cli.parse(Arguments, argv, "render")
-    config = runs.read_config(arguments.directory)
+    config = files.read_config(arguments.directory)
     _check(arguments, config.archive_size)
     headless.check_drawable(config.env)
     video.check()
     headless.choose_backend()
     integrity.check_any(arguments.directory)
-    runs.check_writable(arguments.directory)
+    files.check_writable(arguments.directory)
     runtime.start(config.simulates_in_jax)
     _film(arguments)
 
@@ -96,21 +96,22 @@ def _check(arguments: Arguments, num_policies: int) -> None:
         (arguments.seed < 0, "--seed must be 0 or more."),
     ):
         if wrong:
-            raise cli.UsageError(sentence)
+            raise errors.UsageError(sentence)
 
 
 def _film(arguments: Arguments) -> None:
-    from maxent_jax import analysis, film, rendering
+    from maxent_jax import analysis
+    from maxent_jax.visual import frames, rendering
 
     run = analysis.load_run(arguments.directory, arguments.seed_index, arguments.fallback)
     _check(arguments, run.num_policies)  # fewer than planned where the run is not finished
     with (
-        rendering.scene(run.parts, arguments.size) as large,
-        rendering.scene(run.parts, arguments.size // 2) as small,
+        rendering.scene(run.components, arguments.size) as large,
+        rendering.scene(run.components, arguments.size // 2) as small,
     ):
-        episodes = film.median_episodes(run, run.rollout(arguments.episodes, arguments.seed))
+        episodes = frames.median_episodes(run, run.rollout(arguments.episodes, arguments.seed))
         speed = arguments.speed or max(1.0, _seconds_in_an_episode(run) / VIDEO_SECONDS)
-        shot = film.make(run, large, episodes, speed)
+        shot = frames.make(run, large, episodes, speed)
         where = folder(run.path, run.config.num_seeds, arguments.seed_index)
         studio = _Studio(where, speed, shot._replace(scene=small, speed=None), arguments.stills)
         for i, episode in enumerate(episodes):
@@ -125,7 +126,7 @@ def _film(arguments: Arguments) -> None:
 
 
 def _seconds_in_an_episode(run: "Run") -> float:
-    return run.config.episode_length * float(run.parts.env.dt)
+    return run.config.episode_length * float(run.components.env.dt)
 
 
 class _Studio:
@@ -141,20 +142,22 @@ class _Studio:
         """The episodes at once, to the end of the longest."""
         from PIL import Image
 
-        from maxent_jax import film
+        from maxent_jax.visual import frames
 
         length = max(len(episode.states) for episode in episodes)
         columns = min(len(episodes), math.ceil(math.sqrt(ASPECT * len(episodes))))
         steps = range(0, length, self._every)
-        frames = (
-            film.mosaic([film.picture(shot, episode, step) for episode in episodes], columns)
-            for step in display.track(steps, name)
+        pictures = (
+            frames.mosaic([frames.picture(shot, episode, step) for episode in episodes], columns)
+            for step in progress.track(steps, name)
         )
-        with runs.whole_file(self._folder / f"{name}.mp4") as temporary:
-            video.write(temporary, frames, self._frame_rate)
+        with files.whole_file(self._folder / f"{name}.mp4") as temporary:
+            video.write(temporary, pictures, self._frame_rate)
         self.num_videos += 1
         self.longest = max(self.longest, len(steps) / self._frame_rate)
-        shown = film.stills(length, self._num_stills)
-        tiles = [film.picture(self._still, episode, step) for episode in episodes for step in shown]
-        with runs.whole_file(self._folder / f"{name}.png") as temporary:
-            Image.fromarray(film.mosaic(tiles, columns=len(shown))).save(temporary)
+        shown = frames.stills(length, self._num_stills)
+        tiles = [
+            frames.picture(self._still, episode, step) for episode in episodes for step in shown
+        ]
+        with files.whole_file(self._folder / f"{name}.png") as temporary:
+            Image.fromarray(frames.mosaic(tiles, columns=len(shown))).save(temporary)

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from maxent_jax import headless, integrity, runs, runtime
+from maxent_jax import errors
 from maxent_jax.commands import cli, render
-from maxent_jax.runs import display
+from maxent_jax.runs import files, integrity, progress, runtime
+from maxent_jax.visual import headless
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,14 +49,14 @@ class Arguments:
 def main(argv: Sequence[str]) -> None:
     """Parses and checks, and only then loads jax."""
     arguments = cli.parse(Arguments, argv, "report")
-    configs = [runs.read_config(directory) for directory in arguments.directories]
+    configs = [files.read_config(directory) for directory in arguments.directories]
     path = _check(arguments)
     for directory in arguments.directories:
         integrity.check_any(directory)
     headless.draw_nothing()
     runtime.start(any(config.simulates_in_jax for config in configs))
     page = make(arguments)
-    with runs.whole_file(path) as temporary:
+    with files.whole_file(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     print(f"{path}: {len(page.encode()) / 1e6:.1f} MB.")
 
@@ -64,16 +65,16 @@ def _check(arguments: Arguments) -> Path:
     """Where the page goes."""
     directories = arguments.directories
     if not directories:
-        raise cli.UsageError("name the directory of a run, or of several.")
+        raise errors.UsageError("name the directory of a run, or of several.")
     if len(set(directories)) < len(directories):
-        raise cli.UsageError("a directory is named twice.")
+        raise errors.UsageError("a directory is named twice.")
     if arguments.episodes < 1 or arguments.seed < 0:
-        raise cli.UsageError("--episodes must be at least 1, and --seed 0 or more.")
+        raise errors.UsageError("--episodes must be at least 1, and --seed 0 or more.")
     here = directories[0] if len(directories) == 1 else Path()
     path = arguments.out or here / "report.html"
     if path.is_dir() or not path.parent.is_dir():
-        raise cli.UsageError(f"cannot write to {path}: --out must name a file in a directory.")
-    runs.check_writable(path.parent)
+        raise errors.UsageError(f"cannot write to {path}: --out must name a file in a directory.")
+    files.check_writable(path.parent)
     return path
 
 
@@ -85,15 +86,15 @@ def make(arguments: Arguments) -> str:
     """
     import jinja2
 
-    from maxent_jax import __version__, plotting
-    from maxent_jax.visual import tables
+    from maxent_jax import __version__
+    from maxent_jax.visual import plotting, tables
 
     seeds = {
         str(directory): _load(directory, arguments.fallback) for directory in arguments.directories
     }
     sections: dict[str, list[dict[str, Any]]] = {name: [] for name in seeds}
     all_seeds = [(name, i) for name, of_run in seeds.items() for i in range(len(of_run))]
-    for name, i in display.track(all_seeds, "report"):
+    for name, i in progress.track(all_seeds, "report"):
         sections[name].append(_seed_section(seeds[name][i], i, arguments))
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -109,7 +110,7 @@ def make(arguments: Arguments) -> str:
 def _load(directory: Path, fallback: bool) -> list["Run"]:
     from maxent_jax import analysis
 
-    num_seeds = runs.read_config(directory).num_seeds
+    num_seeds = files.read_config(directory).num_seeds
     return [analysis.load_run(directory, i, fallback) for i in range(num_seeds)]
 
 
@@ -118,7 +119,7 @@ def _run_section(name: str, seeds: Sequence["Run"]) -> dict[str, Any]:
     from maxent_jax.visual import tables
 
     config = seeds[0].config
-    content = json.loads((seeds[0].path / runs.CONFIG).read_text(encoding="utf-8"))
+    content = json.loads((seeds[0].path / files.CONFIG).read_text(encoding="utf-8"))
     return {
         "name": name,
         "config": config,
@@ -135,13 +136,13 @@ def _seed_section(run: "Run", seed_index: int, arguments: Arguments) -> dict[str
     import jax.numpy as jnp
     import numpy as np
 
-    from maxent_jax import analysis, plotting
+    from maxent_jax import analysis
     from maxent_jax.density import histogram
-    from maxent_jax.visual import tables
+    from maxent_jax.visual import plotting, tables
 
     visited = run.occupancy(arguments.episodes, arguments.seed)
     paths = analysis.paths(visited)
-    cells = histogram.count(jnp.asarray(visited.states), run.parts.grid, visited.weight)
+    cells = histogram.count(jnp.asarray(visited.states), run.components.grid, visited.weight)
     return {
         "seed": run.seed,
         "curves": _svg(plotting.curves(run)) if run.metrics else None,

@@ -18,13 +18,14 @@ from typing import Annotated
 
 import tyro
 
-from maxent_jax import headless, runs, runtime
-from maxent_jax.choices import check_choice
+from maxent_jax import errors
+from maxent_jax.checks import check_choice
 from maxent_jax.commands import cli, train
-from maxent_jax.runs import locks
-from maxent_jax.runs.interruption import heeded
+from maxent_jax.runs import locks, runtime
+from maxent_jax.runs.signals import heeded
 from maxent_jax.studies import protocol
 from maxent_jax.studies.protocol import Cell
+from maxent_jax.visual import headless
 
 # What a figure of the paper is made of: studies, by name. Fig. 3's other half, weights on Ant, is
 # the study `weights`: on a CPU it takes longer than all the rest.
@@ -66,9 +67,9 @@ def main(argv: Sequence[str]) -> None:
     headless.draw_nothing()
     if "fig3" in whats:
         runtime.prepare(simulates_in_jax=False)
-        from maxent_jax.studies import classic_weights  # loads jax
+        from maxent_jax.studies import hazan_weights  # loads jax
 
-        classic_weights.held(arguments.out / "fig3", arguments.scale, arguments.seeds)
+        hazan_weights.held(arguments.out / "fig3", arguments.scale, arguments.seeds)
     for name, cells in studies.items():
         protocol.claim(arguments.out / name, name, arguments.scale, cells)
     for what in whats:
@@ -91,10 +92,10 @@ def main(argv: Sequence[str]) -> None:
     if left and arguments.figures:
         print(f"{len(left)} cells are not finished, {left[0]} the first: no figures yet.")
     elif arguments.figures:
-        from maxent_jax.studies import reproduced  # loads jax
+        from maxent_jax.studies import results  # loads jax
 
         runtime.start(simulates_in_jax=False)
-        reproduced.draw(whats, arguments.scale, arguments.seeds, arguments.out, studies)
+        results.draw(whats, arguments.scale, arguments.seeds, arguments.out, studies)
 
 
 def _check(arguments: Arguments) -> tuple[int, int]:
@@ -102,18 +103,18 @@ def _check(arguments: Arguments) -> tuple[int, int]:
     check_choice("study", arguments.what, ("all", *FIGURES, *protocol.STUDIES))
     check_choice("scale", arguments.scale, protocol.SCALES)
     if arguments.seeds is not None and arguments.seeds < 1:
-        raise cli.UsageError(f"seeds is {arguments.seeds}, but a study needs at least 1.")
+        raise errors.UsageError(f"seeds is {arguments.seeds}, but a study needs at least 1.")
     if arguments.jobs < 1:
-        raise cli.UsageError(f"jobs is {arguments.jobs}, but must be at least 1.")
+        raise errors.UsageError(f"jobs is {arguments.jobs}, but must be at least 1.")
     shard = re.fullmatch(r"([0-9]+)/([0-9]+)", arguments.shard)
     if shard is None or int(shard[1]) >= int(shard[2]):
-        raise cli.UsageError(f"shard is {arguments.shard}, but must be I/N with 0 <= I < N.")
+        raise errors.UsageError(f"shard is {arguments.shard}, but must be I/N with 0 <= I < N.")
     if FIGURES.get(arguments.what) == () and (not arguments.figures or int(shard[2]) > 1):
-        raise cli.UsageError(
+        raise errors.UsageError(
             f"{arguments.what} has no cells to share: leave out --shard and --no-figures."
         )
     if arguments.out.is_file():
-        raise cli.UsageError(f"out {arguments.out} is a file: name a folder.")
+        raise errors.UsageError(f"out {arguments.out} is a file: name a folder.")
     return int(shard[1]), int(shard[2])
 
 
@@ -132,10 +133,10 @@ def _train(directory: Path, cells: Sequence[Cell]) -> int:
             with train.claimed(train.Arguments(cell.config, out=at, resume=True)):
                 from maxent_jax.runs import driver  # loads jax
 
-                driver.train(cell.config, at, started, driver.Options(fallback=True))
+                train.run_to_end(cell.config, at, started, driver.Options(fallback=True))
         except locks.BusyError:
             continue
-        except (runs.RunError, runs.NonFiniteError) as error:
+        except (errors.RunError, errors.NonFiniteError) as error:
             print(f"error: {error} Going on with the next.", file=sys.stderr)
             failures += 1
     return failures

@@ -10,9 +10,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from maxent_jax import headless, runs, runtime
+from maxent_jax import errors
 from maxent_jax.commands import cli
-from maxent_jax.runs import display
+from maxent_jax.runs import files, progress, runtime
+from maxent_jax.visual import headless
 
 FITTED = ("river swim", "Garnet", "double chain", "four rooms", "open grid")
 PLAIN = ("river swim", "Garnet", "double chain", "small rooms")  # where an iteration costs little
@@ -52,12 +53,12 @@ def main(argv: Sequence[str]) -> None:
     arguments = _check(cli.parse(Arguments, argv, "theory"))
     headless.draw_nothing()
     runtime.start(simulates_in_jax=False)
-    results = runs.jsonable(study(arguments))
+    results = files.jsonable(study(arguments))
     from maxent_jax.theory import tabular_figures
 
     folder = arguments.figures or arguments.out.parent
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    runs.write_json(arguments.out, results)
+    files.write_json(arguments.out, results)
     paths = tabular_figures.draw(results, folder)
     _print(results)
     print(", ".join(str(path) for path in (arguments.out, *paths)))
@@ -72,7 +73,7 @@ def study(arguments: Arguments) -> dict[str, Any]:
     from maxent_jax.theory import tabular_problems as problems
     from maxent_jax.theory import tabular_studies as studies
 
-    started, track = time.perf_counter(), display.track
+    started, track = time.perf_counter(), progress.track
     known = (
         problems.known(arguments.seeds, arguments.discount, arguments.toy)
         if arguments.mdp is None
@@ -92,7 +93,7 @@ def study(arguments: Arguments) -> dict[str, Any]:
     noisy, played = among("Garnet")[0], among("double chain")[0]
     results = {
         "settings": dataclasses.asdict(arguments) | {"out": None, "figures": None},
-        "versions": runs.stack(),
+        "versions": files.stack(),
         "bounds": studies.bound_table(),
         "rates": {name: studies.rate(made[name], T) for name in track(fitted, "rates")},
         "methods": {
@@ -132,7 +133,7 @@ def _check(arguments: Arguments) -> Arguments:
         (arguments.out.is_dir(), f"--out {arguments.out} is a folder: name a file."),
     ):
         if wrong:
-            raise cli.UsageError(sentence)
+            raise errors.UsageError(sentence)
     return arguments
 
 

@@ -13,13 +13,18 @@ import shutil
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from maxent_jax import headless, integrity, runs, runtime
+from maxent_jax import errors
 from maxent_jax.commands import cli
 from maxent_jax.config import Config, preset
-from maxent_jax.runs import locks
-from maxent_jax.runs.sinks import FOLDERS as SINKS
-from maxent_jax.runs.sinks import Sinks
+from maxent_jax.runs import files, integrity, locks, runtime
+from maxent_jax.runs.loggers import FOLDERS as SINKS
+from maxent_jax.runs.loggers import Sinks
+
+if TYPE_CHECKING:
+    from maxent_jax.runs.driver import Options
+from maxent_jax.visual import headless
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +73,7 @@ def read_arguments(argv: Sequence[str]) -> Arguments:
       UsageError, ConfigError, RunError: one sentence each.
     """
     if cli.flag_value(argv, "--out") == "":
-        raise cli.UsageError("out is empty: name a directory, or leave --out away.")
+        raise errors.UsageError("out is empty: name a directory, or leave --out away.")
     default = Arguments(_default_config(argv))
     arguments = cli.parse(Arguments, argv, "train", default=default)
     _check_saving(arguments)
@@ -82,8 +87,8 @@ def _default_config(argv: Sequence[str]) -> Config:
     values = {name: cli.flag_value(argv, f"--{name}") for name in ("preset", "env", "method")}
     given = {name: value for name, value in values.items() if value}
     out = cli.flag_value(argv, "--out")
-    if "--resume" in argv and out and not given and Path(out, runs.CONFIG).exists():
-        return runs.read_config(Path(out))
+    if "--resume" in argv and out and not given and Path(out, files.CONFIG).exists():
+        return files.read_config(Path(out))
     name = given.pop("preset", Config.preset)
     return preset(name, **given)
 
@@ -117,16 +122,16 @@ def check_free(arguments: Arguments) -> None:
         if not directory.exists() or (directory.is_dir() and _is_nobodys(directory)):
             return
     except OSError as error:
-        raise cli.UsageError(f"cannot write to {directory}: {error.strerror}.") from None
+        raise errors.UsageError(f"cannot write to {directory}: {error.strerror}.") from None
     if arguments.resume:
-        runs.check_config(directory, arguments.config)
+        files.check_config(directory, arguments.config)
     elif not arguments.overwrite:
-        raise cli.UsageError(
+        raise errors.UsageError(
             f"{directory} already exists: choose another --out, or add --resume to go on with it "
             f"or --overwrite to begin anew."
         )
-    elif not runs.is_config(directory / runs.CONFIG):
-        raise cli.UsageError(f"{directory} is not the directory of a run: it is left as it is.")
+    elif not files.is_config(directory / files.CONFIG):
+        raise errors.UsageError(f"{directory} is not the directory of a run: it is left as it is.")
 
 
 def _check_writable(directory: Path) -> None:
@@ -135,13 +140,13 @@ def _check_writable(directory: Path) -> None:
     try:
         str(directory.absolute()).encode()
     except UnicodeEncodeError:  # bytes that are no text, which TensorStore cannot take
-        raise cli.UsageError(f"cannot write to {directory}: its path must be UTF-8.") from None
+        raise errors.UsageError(f"cannot write to {directory}: its path must be UTF-8.") from None
     if place.is_symlink() and not place.exists():
-        raise cli.UsageError(f"cannot write to {directory}: {place} is a link to nowhere.")
+        raise errors.UsageError(f"cannot write to {directory}: {place} is a link to nowhere.")
     if not place.is_dir() and place != directory:
-        raise cli.UsageError(f"cannot write to {directory}: {place} is no directory.")
+        raise errors.UsageError(f"cannot write to {directory}: {place} is no directory.")
     if place.is_dir() and not os.access(place, os.W_OK | os.X_OK):
-        raise cli.UsageError(f"cannot write to {directory}: {place} is not writable.")
+        raise errors.UsageError(f"cannot write to {directory}: {place} is not writable.")
 
 
 def _is_nobodys(directory: Path) -> bool:
@@ -153,24 +158,26 @@ def _is_nobodys(directory: Path) -> bool:
 
 def _is_of_a_beginning(path: Path) -> bool:
     directory = path.parent
-    if path.name == runs.CONFIG and path.is_file():
-        return runs.is_config(path)
-    if path.name == runs.METRICS:
+    if path.name == files.CONFIG and path.is_file():
+        return files.is_config(path)
+    if path.name == files.METRICS:
         return path.is_file() and path.stat().st_size == 0
     if path.name == integrity.FOLDER:
         unfinished = path.is_dir() and all(
             inside.name.startswith(integrity.UNFINISHED) for inside in path.iterdir()
         )
         return unfinished and not path.is_symlink()
-    temporary = {runs.temporary_of(directory / name).name for name in (runs.CONFIG, runs.METRICS)}
+    temporary = {
+        files.temporary_of(directory / name).name for name in (files.CONFIG, files.METRICS)
+    }
     if path.name in SINKS:
-        return (directory / runs.CONFIG).is_file()
+        return (directory / files.CONFIG).is_file()
     return path.name in {locks.LOCK, *temporary}
 
 
 def _remove_run(directory: Path) -> None:
     """All that a run writes, and nothing else."""
-    for name in runs.WRITTEN:
+    for name in files.WRITTEN:
         path = directory / name
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
@@ -198,7 +205,7 @@ def _check_saving(arguments: Arguments) -> None:
         ),
     ):
         if wrong:
-            raise cli.UsageError(sentence)
+            raise errors.UsageError(sentence)
 
 
 def _check_hosts(arguments: Arguments) -> None:
@@ -231,7 +238,7 @@ def _check_hosts(arguments: Arguments) -> None:
         ),
     ):
         if wrong:
-            raise cli.UsageError(sentence)
+            raise errors.UsageError(sentence)
 
 
 def main(argv: Sequence[str]) -> None:
@@ -263,9 +270,26 @@ def main(argv: Sequence[str]) -> None:
     driver.check(config, options)  # before there is a directory
     with holding:
         hosts.wait_for_all("claimed")
-        driver.train(config, arguments.directory, started, options)
+        run_to_end(config, arguments.directory, started, options)
     if hosts.is_first():
+        _print_figures(arguments.directory)
         _point_onward(arguments.directory)
+
+
+def run_to_end(config: Config, directory: Path, started: float, options: "Options") -> None:
+    """Trains what is left of the run, and draws its figures. See driver.train."""
+    from maxent_jax.runs import driver, hosts  # loads jax
+    from maxent_jax.visual import figures
+
+    driver.train(config, directory, started, options)
+    if hosts.is_first():
+        figures.draw_missing(directory)
+
+
+def _print_figures(directory: Path) -> None:
+    from maxent_jax.visual import plotting
+
+    print(f"figures: {directory / files.FIGURES}/{{{','.join(plotting.NAMES)}}}.png")
 
 
 def _point_onward(directory: Path) -> None:

@@ -11,8 +11,8 @@ from typing import Annotated
 
 import tyro
 
-from maxent_jax import integrity, runs
 from maxent_jax.commands import cli
+from maxent_jax.runs import files, integrity
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Arguments:
 def main(argv: Sequence[str]) -> None:
     """Loads no array library."""
     directory = cli.parse(Arguments, argv, "verify").directory
-    runs.read_config(directory)
+    files.read_config(directory)
     integrity.check_any(directory)
     if not verify(directory, integrity.checkpoints(directory)):
         sys.exit(1)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import digamma, gammaln
 
-from maxent_jax.choices import check_whole
+from maxent_jax.checks import check_whole
 from maxent_jax.density.knn import knn_distances
 
 

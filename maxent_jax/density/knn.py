@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from maxent_jax import native
-from maxent_jax.choices import check_whole
+from maxent_jax.checks import check_whole
 
 NONE_EXCLUDED = -1
 # Points handled at once, unrolled. Measured on two cores with AVX-512 inside a scan: few queries

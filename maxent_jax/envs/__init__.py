@@ -20,20 +20,14 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an optio
 from brax import envs as brax_envs
 from brax.envs.base import Env
 
-from maxent_jax.choices import (
-    ConfigError,
-    ConfigTypeError,
-    check_env,
-    check_number,
-    check_path,
-    check_physics,
-    check_whole,
-)
+from maxent_jax.checks import check_number, check_path, check_whole
+from maxent_jax.config.names import check_env, check_physics
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import ant, humanoid, mountain_car, pendulum, walker2d
 from maxent_jax.envs.physics import REFERENCE, Options, PhysicsState
 from maxent_jax.envs.task import MujocoEnv, Task, uniform_reset
 from maxent_jax.envs.torso import Torso
+from maxent_jax.errors import ConfigError, ConfigTypeError
 from maxent_jax.types import Features
 
 TASKS = {task.name: task for task in (ant.TASK, walker2d.TASK, humanoid.TASK)}

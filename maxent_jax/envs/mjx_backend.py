@@ -12,8 +12,8 @@ import mujoco
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver
 
-from maxent_jax.choices import ConfigError
 from maxent_jax.envs.physics import Derived, Physics, PhysicsState
+from maxent_jax.errors import ConfigError
 
 WARP_CONTACTS = 2**17  # contacts that Warp has room for, all environments together
 WARP_CONSTRAINTS = 512  # rows of the constraint solver, for each environment

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import mujoco
 
-from maxent_jax.choices import ConfigError
+from maxent_jax.errors import ConfigError
 
 
 class PhysicsState(NamedTuple):

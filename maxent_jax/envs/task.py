@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import mujoco
 from brax.envs.base import Env, State
 
-from maxent_jax.choices import BACKENDS, PHYSICS, ConfigError, check_choice, check_number
+from maxent_jax.checks import check_choice, check_number
+from maxent_jax.config.names import BACKENDS, PHYSICS
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import mjx_backend, mujoco_backend, physics
 from maxent_jax.envs.physics import Derived, Options, PhysicsState
 from maxent_jax.envs.torso import Torso
+from maxent_jax.errors import ConfigError
 from maxent_jax.precision import in_32_bits
 
 

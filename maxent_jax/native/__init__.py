@@ -13,7 +13,7 @@ from pathlib import Path
 
 import jax
 
-from maxent_jax.choices import ConfigError
+from maxent_jax.errors import ConfigError
 
 TARGETS = ("maxent_knn", "maxent_physics")
 CUDA_TARGET = "maxent_knn_cuda"

@@ -1,4 +1,4 @@
-"""Runs the three programs of an iteration one by one, and logs, saves and draws in between."""
+"""Runs the three programs of an iteration one by one, and logs and saves in between."""
 
 import os
 import shutil
@@ -9,30 +9,17 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from maxent_jax import (
-    algorithm,
-    checkpoint,
-    devices,
-    integrity,
-    memory,
-    methods,
-    native,
-    parts,
-    plotting,
-    runs,
-    runtime,
-)
-from maxent_jax.algorithm import Programs, State
-from maxent_jax.checkpoint import Progress
-from maxent_jax.choices import UsageError
+from maxent_jax import algorithm, components, native
+from maxent_jax.algorithm import Programs, State, devices, methods
 from maxent_jax.config import Config
-from maxent_jax.runs import hosts
+from maxent_jax.errors import UsageError
+from maxent_jax.runs import checkpoint, files, hosts, integrity, memory, runtime
+from maxent_jax.runs.checkpoint import Progress
 from maxent_jax.runs.clock import Clock
-from maxent_jax.runs.display import Bar, announce, duration, say
-from maxent_jax.runs.interruption import Interrupted, Interruption
-from maxent_jax.runs.sinks import Sinks
+from maxent_jax.runs.loggers import Sinks
+from maxent_jax.runs.progress import Bar, announce, duration, say
+from maxent_jax.runs.signals import Interrupted, Interruption
 from maxent_jax.runs.stages import Stage, advance, check_finite
-from maxent_jax.visual import figures
 
 
 class Options(NamedTuple):
@@ -81,8 +68,6 @@ def train(
     if progress is not None and len(progress.rows) == config.num_iterations:
         hosts.leave()
         if hosts.is_first():
-            if not plotting.all_saved(directory):  # killed after its last checkpoint
-                figures.draw(directory)
             print(f"{directory} is complete: nothing to train.")
         return
     if hosts.is_first():
@@ -95,7 +80,6 @@ def train(
     rows = _train(config, directory, programs, stage, process_started, options)
     hosts.leave()
     if hosts.is_first():
-        figures.draw(directory)
         _summarise(config, directory, rows)
 
 
@@ -117,9 +101,9 @@ def _placement(config: Config, num_devices: int) -> State | None:
 
 def _fresh(config: Config, directory: Path, placed: State | None) -> Stage:
     def write() -> None:
-        machine = {"backend": parts.make(config).env.backend} | _machine()
-        runs.write_config(directory, config, methods.row(config)._asdict(), machine)
-        runs.write_metrics(directory, [])
+        machine = {"backend": components.make(config).env.backend} | _machine()
+        files.write_config(directory, config, methods.row(config)._asdict(), machine)
+        files.write_metrics(directory, [])
 
     hosts.first_alone(write, "config")
     state = algorithm.start(config) if placed is None else devices.start(config, placed)
@@ -139,13 +123,13 @@ def _last_progress(directory: Path, options: Options) -> Progress | None:
             say(
                 f"note: {sentence[:-1]}; it is removed, and the run goes on from checkpoint {name}."
             )
-        for what, now in (runs.stack() | _machine()).items():
+        for what, now in (files.stack() | _machine()).items():
             if computed_with.get(what) != now:
                 say(
                     f"note: {what} was {computed_with.get(what)} and is {now}: from here on the "
                     f"run may not be bit-identical to an undisturbed one."
                 )
-        runs.write_metrics(directory, progress.rows)
+        files.write_metrics(directory, progress.rows)
 
     hosts.first_alone(go_back_to_it, "resumed")
     return progress
@@ -187,7 +171,7 @@ def _train(
             iteration_ended = progress.begun is None
             if iteration_ended:
                 if hosts.is_first():
-                    runs.append_metrics(directory, progress.rows[-1])
+                    files.append_metrics(directory, progress.rows[-1])
                 pass_on(progress.rows[-1])
             due = (
                 time.perf_counter() - saved_at >= 60 * options.save_minutes
@@ -207,13 +191,12 @@ def _train(
 
 def _summarise(config: Config, directory: Path, rows: list[dict[str, Any]]) -> None:
     last = rows[-1]
-    cells = parts.make(config).grid.num_cells
+    cells = components.make(config).grid.num_cells
     random = ""
     if "random_coverage" in last:
         random = f" (a random policy: {np.mean(last['random_coverage']):,.0f})"
     print(
         f"{directory}: training visited {np.mean(last['cumulative_coverage']):,.0f} of {cells:,} "
         f"cells{random}, the mixture of {config.archive_size} policies "
-        f"{np.mean(last['mixture_coverage']):,.0f}; {duration(last['wall_seconds'])}.\n"
-        f"figures: {directory / runs.FIGURES}/{{{','.join(plotting.NAMES)}}}.png"
+        f"{np.mean(last['mixture_coverage']):,.0f}; {duration(last['wall_seconds'])}."
     )

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import filelock
 
-from maxent_jax import runs
-from maxent_jax.choices import UsageError
+from maxent_jax.errors import UsageError
+from maxent_jax.runs import files
 
 LOCK = "lock"
 
@@ -44,5 +44,5 @@ def is_free(directory: Path, first: str) -> bool:
     """Whether a directory holds nothing but its lock and what a killed process left of the file of
     that name, the first that is written.
     """
-    begun = (LOCK, runs.temporary_of(directory / first).name)
+    begun = (LOCK, files.temporary_of(directory / first).name)
     return all(path.name in begun for path in directory.iterdir())

@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from maxent_jax import algorithm, integrity, runs
+from maxent_jax import algorithm, errors
 from maxent_jax.algorithm import Programs, State
-from maxent_jax.checkpoint import Progress
+from maxent_jax.algorithm.convergence import has_plateaued
 from maxent_jax.config import Config
-from maxent_jax.convergence import has_plateaued
+from maxent_jax.runs import files, integrity
+from maxent_jax.runs.checkpoint import Progress
 from maxent_jax.runs.clock import Clock
-from maxent_jax.runs.display import Bar
+from maxent_jax.runs.progress import Bar
 
 
 class Stage(NamedTuple):
@@ -40,7 +41,7 @@ def advance(
         bar.segment_done()
         return Stage(state, progress._replace(segments=[*progress.segments, metrics]))
     state, at_end = clock.time("wall_end", programs.end, state)
-    row = runs.jsonable(_row(config, progress, at_end) | clock.end_iteration())
+    row = files.jsonable(_row(config, progress, at_end) | clock.end_iteration())
     bar.iteration_done(row)
     return Stage(state, progress._replace(rows=[*progress.rows, row], begun=None, segments=[]))
 
@@ -88,7 +89,7 @@ def check_finite(directory: Path, state: State, progress: Progress) -> None:
     if wrong:
         where = jax.tree_util.keystr(wrong[0], simple=True, separator=".")
         iteration = len(progress.rows) + (progress.begun is not None)
-        raise runs.NonFiniteError(
+        raise errors.NonFiniteError(
             f"iteration {iteration} left the finite numbers after {len(progress.segments)} of its "
             f"segments (first in {where}); nothing of that is saved, {directory} holds the run "
             f"up to checkpoint {(integrity.checkpoints(directory) or ['none'])[-1]}."

@@ -10,11 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from maxent_jax import plotting
 from maxent_jax.analysis import load_run, paths
 from maxent_jax.density import histogram
-from maxent_jax.studies.raw import RANDOM
 from maxent_jax.studies.statistics import interquartile_mean, interval_of_curves
+from maxent_jax.studies.values import RANDOM
+from maxent_jax.visual import plotting
 
 Axis = tuple[str, str, float]  # a column, what it is called, and its factor
 Band = tuple[np.ndarray, ...]  # middle, low, high; [iterations] each
@@ -165,7 +165,7 @@ def occupancies(directories: Mapping[str, Path]) -> Figure:
     for row, (method, directory) in zip(axes, directories.items(), strict=True):
         run = load_run(directory)
         visited = run.occupancy()
-        cells = np.asarray(histogram.count(visited.states, run.parts.grid, visited.weight))
+        cells = np.asarray(histogram.count(visited.states, run.components.grid, visited.weight))
         plotting.draw_occupancy(row[0], run, run.histogram / max(run.histogram.sum(), 1))
         plotting.draw_occupancy(row[1], run, cells)
         plotting.draw_paths(row[2], run, paths(visited))

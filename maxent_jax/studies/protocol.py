@@ -12,11 +12,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from maxent_jax import integrity, runs
-from maxent_jax.choices import BASELINES, CLASSIC_ENVS, MUJOCO_ENVS, UsageError
 from maxent_jax.config import DEFAULTS, Config, preset
-from maxent_jax.presets import PLAIN
-from maxent_jax.runs import locks
+from maxent_jax.config.names import BASELINES, CLASSIC_ENVS, MUJOCO_ENVS
+from maxent_jax.config.presets import PLAIN
+from maxent_jax.errors import UsageError
+from maxent_jax.runs import files, integrity, locks
 
 STUDY = "study.json"
 VERSION = 1  # of a study's directory
@@ -191,7 +191,7 @@ def claim(directory: Path, study: str, scale: str, cells: list[Cell]) -> None:
     Raises:
       UsageError: it holds another study, or this one with other settings, or cannot be written.
     """
-    content = runs.jsonable(
+    content = files.jsonable(
         {
             "version": VERSION,
             "study": study,
@@ -218,7 +218,7 @@ def _claim(directory: Path, content: Changes) -> None:
             return
     elif not locks.is_free(directory, STUDY):
         raise UsageError(f"{directory} is no study's, and not empty: choose another --out.")
-    runs.write_json(path, content)
+    files.write_json(path, content)
 
 
 def _difference(held: Changes, asked: Changes) -> str:
@@ -241,7 +241,7 @@ def home(directory: Path, cell: Cell) -> Path:
     """
     own = directory / cell.name
     if not own.exists():
-        config = runs.jsonable(dataclasses.asdict(cell.config))
+        config = files.jsonable(dataclasses.asdict(cell.config))
         for study in sorted(directory.parent.glob(f"*/{STUDY}")):
             for name, held in _cells(study).items():
                 if held == config and (study.parent / name).exists():
@@ -266,5 +266,5 @@ def finished(directory: Path, cell: Cell) -> bool:
     at = home(directory, cell)
     if integrity.checkpoints(at)[-1:] != [f"{cell.config.num_iterations}"]:
         return False
-    runs.check_config(at, cell.config)
+    files.check_config(at, cell.config)
     return True

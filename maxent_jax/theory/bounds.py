@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from maxent_jax.choices import check_number, check_whole
+from maxent_jax.checks import check_number, check_whole
 
 Errors = float | Sequence[float]
 

@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from maxent_jax import methods, mixture
+from maxent_jax import mixture
+from maxent_jax.algorithm import methods
 from maxent_jax.theory import tabular
 from maxent_jax.theory.mdps import Mdp
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from maxent_jax import plotting
+from maxent_jax.visual import plotting
 
 METHODS = {  # colour and line
     "V": ("#d1495b", "-"),

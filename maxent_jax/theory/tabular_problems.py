@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from maxent_jax import methods
-from maxent_jax.choices import UsageError
+from maxent_jax.algorithm import methods
+from maxent_jax.errors import UsageError
 from maxent_jax.theory import bounds, loop, mdps, optimum, tabular
 from maxent_jax.theory.mdps import Dynamics, Mdp
 

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import special, stats
 
-from maxent_jax import methods, rewards
+from maxent_jax import rewards
+from maxent_jax.algorithm import methods
 from maxent_jax.theory import bounds, loop, mdps, optimum, peers, reference, tabular
 from maxent_jax.theory import tabular_problems as problems
 from maxent_jax.theory.tabular_problems import FIT_FROM, Problem

@@ -7,17 +7,27 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from maxent_jax import plotting
 from maxent_jax.analysis import load_run, paths
 from maxent_jax.density import histogram
+from maxent_jax.visual import plotting
 
 
-def draw(directory: Path) -> None:
-    """In this process or, beside others, whose devices are out of reach, in one of its own."""
-    if jax.process_count() == 1:
-        draw_here(directory)
+def draw_missing(directory: Path) -> None:
+    """Rolls the archived policies out and draws the figures of a run, unless they are there.
+
+    Of several processes, whose devices are out of each other's reach, one draws in a process of its
+    own.
+
+    Raises:
+      SaveError: a figure cannot be written.
+      RuntimeError: the other process failed.
+    """
+    if plotting.all_saved(directory):
         return
-    alone = multiprocessing.get_context("spawn").Process(target=draw_here, args=(directory,))
+    if jax.process_count() == 1:
+        _draw(directory)
+        return
+    alone = multiprocessing.get_context("spawn").Process(target=_draw, args=(directory,))
     os.environ["JAX_PLATFORMS"] = "cpu"  # of the child: the accelerator's memory is taken
     alone.start()
     alone.join()
@@ -25,9 +35,8 @@ def draw(directory: Path) -> None:
         raise RuntimeError(f"drawing the figures of {directory} failed; --resume tries again.")
 
 
-def draw_here(directory: Path) -> None:
-    """Rolls the archived policies out, and draws."""
+def _draw(directory: Path) -> None:
     run = load_run(directory)
     visited = run.occupancy()
-    cells = histogram.count(visited.states, run.parts.grid, visited.weight)
+    cells = histogram.count(visited.states, run.components.grid, visited.weight)
     plotting.save_all(run, np.asarray(cells), paths(visited))

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from maxent_jax import plotting
 from maxent_jax.analysis import Run
 from maxent_jax.config import Config
-from maxent_jax.occupancy import Occupancy
+from maxent_jax.mixture.occupancy import Occupancy
+from maxent_jax.visual import plotting
 
 MISSING = "–"
 METRICS = (  # name, head, format
@@ -58,7 +58,7 @@ def last(run: Run, name: str) -> Any:
 def headline(seeds: Sequence[Run]) -> dict[str, Any]:
     """A sentence about a run, and its figures: means over the seeds."""
     first = seeds[0]
-    cells = f"of {first.parts.grid.num_cells:,}"
+    cells = f"of {first.components.grid.num_cells:,}"
     trained = f"{first.num_policies - 1} of {first.config.archive_size - 1} policies trained"
     kind = "1 seed" if len(seeds) == 1 else f"{len(seeds)} seeds, of which these are the means"
     tiles = (
@@ -113,7 +113,7 @@ def iterations(run: Run) -> Table:
 
 def policies(run: Run, visited: Occupancy, seed: int) -> Table:
     """What each policy does in fresh episodes."""
-    where = ", ".join(run.parts.grid.names)
+    where = ", ".join(run.components.grid.names)
     rows = [
         [
             f"π{summary.policy}" + (" (untrained)" if summary.policy == 0 else ""),

@@ -9,7 +9,7 @@ from subprocess import PIPE
 
 import numpy as np
 
-from maxent_jax.choices import UsageError
+from maxent_jax.errors import UsageError
 
 QUALITY = 21  # x264's constant rate factor: 18 looks lossless, 23 is its default
 

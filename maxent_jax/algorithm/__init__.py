@@ -1,0 +1,41 @@
+"""Algorithm 1 of the paper: the outer loop, the training within an iteration, and its methods."""
+
+from maxent_jax.algorithm.loop import (
+    EVALUATION_SEED,
+    SEED_AXES,
+    Programs,
+    State,
+    begin,
+    compiled,
+    coverage,
+    end,
+    functions,
+    init,
+    iterate,
+    programs,
+    reduce_metrics,
+    run,
+    shapes,
+    start,
+    train_segment,
+)
+
+__all__ = [
+    "EVALUATION_SEED",
+    "SEED_AXES",
+    "Programs",
+    "State",
+    "begin",
+    "compiled",
+    "coverage",
+    "end",
+    "functions",
+    "init",
+    "iterate",
+    "programs",
+    "reduce_metrics",
+    "run",
+    "shapes",
+    "start",
+    "train_segment",
+]

@@ -1,0 +1,242 @@
+"""What the replay keeps of training: each state once, with its distances to the reference.
+
+An item is a step. It holds what the networks see of the state that the step reached, and points at
+the one that it left: the item of the step before or, for an episode's first, an entry of the pool
+of starts. Of copies, whole episodes turned by a yaw, only the angles and what is measured are
+stored: the states are turned when drawn.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from maxent_jax.components import Components
+from maxent_jax.density.knn import knn_distances
+from maxent_jax.sac import replay
+from maxent_jax.sac.replay import Replay
+from maxent_jax.types import Distances, Experience, Outcomes, Transition
+
+POSITION_DIMS = 2  # the features that are metres, first in every feature map
+# Of a full ring's oldest items, those whose former state may have been overwritten: the items of
+# one step of all envs, and of the next if the ring's end parts them.
+STEPS_WITHOUT_START = 2
+
+
+class Reference(NamedTuple):
+    """The states that define r_t; the first `num_filled` points are there."""
+
+    points: jax.Array  # [M, F]
+    num_filled: jax.Array  # [] int32
+
+
+class Step(NamedTuple):
+    """An item of the replay; V = 1 + yaw copies variants of a step, the first unturned."""
+
+    state: jax.Array  # [num_seen] of the state reached, float32 or float16
+    features: jax.Array  # [V, F] of it, float32
+    previous: jax.Array  # [] int32: the item with the state left, or -1 - its row in the starts
+    following: jax.Array  # [] int32: the episode's next item, -1 where there is none
+    action: jax.Array  # [A]
+    terminated: jax.Array  # [] bool
+    bonus: jax.Array  # [] episodic term, feature units
+    angle: jax.Array | None  # [V - 1] radians, an episode's own; None without copies
+    distances: Distances  # [V]
+
+
+def init(components: Components) -> Replay:
+    """An empty replay."""
+    config = components.config
+    scalar, variants = jnp.zeros(()), jnp.zeros(1 + config.yaw_copies)
+    step = Step(
+        state=jnp.zeros(components.num_seen, config.replay_dtype),
+        features=jnp.zeros((1 + config.yaw_copies, len(components.phi.names))),
+        previous=jnp.zeros((), jnp.int32),
+        following=jnp.zeros((), jnp.int32),
+        action=jnp.zeros(components.sac.action_size),
+        terminated=jnp.zeros((), bool),
+        bonus=scalar,
+        angle=variants[1:] if config.yaw_copies else None,
+        distances=Distances(variants, variants, variants),
+    )
+    return replay.init(step, config.replay_size)
+
+
+def add(
+    components: Components,
+    reference: Reference,
+    ring: Replay,
+    transition: Transition,
+    previous: jax.Array,
+    bonus: jax.Array,
+    key: jax.Array,
+) -> tuple[Replay, jax.Array]:
+    """The replay with the valid transitions [N, ...] in it, and the rows where they went, [N].
+
+    Args:
+      previous: [N] as in Step.
+      bonus: [N].
+      key: for the yaw of the copies of episodes that begin.
+    """
+    config = components.config
+    angle = None
+    if config.yaw_copies:
+        shape = (transition.valid.shape[0], config.yaw_copies)
+        angle = jax.random.uniform(key, shape, minval=-jnp.pi, maxval=jnp.pi)
+        goes_on = (previous >= 0)[:, None]
+        angle = jnp.where(goes_on, ring.items.angle[jnp.maximum(previous, 0)], angle)
+    after = _variants(components, transition.next_observation, angle)
+    step = Step(
+        state=_encoded(components, transition.next_observation),
+        features=after,
+        previous=previous,
+        following=jnp.full_like(previous, -1),
+        action=transition.action,
+        terminated=transition.terminated,
+        bonus=bonus,
+        angle=angle,
+        distances=measure(
+            components, reference, _variants(components, transition.observation, angle), after
+        ),
+    )
+    rows = replay.destinations(ring, transition.valid)
+    ring = replay.add(ring, step, transition.valid)
+    links = jnp.where(transition.valid & (previous >= 0), previous, config.replay_size)
+    following = ring.items.following.at[links].set(rows, mode="drop")
+    return ring._replace(items=ring.items._replace(following=following)), rows
+
+
+def sample(
+    components: Components, ring: Replay, starts: jax.Array, shape: tuple[int, ...], key: jax.Array
+) -> Experience:
+    """Drawn uniformly with replacement: [*shape, ...] items, with the steps that follow each.
+
+    Of observations, what the networks see: [*shape, num_seen].
+
+    Args:
+      starts: [R, D] the pool of states from which the episodes began.
+    """
+    config = components.config
+    key_rows, key_variant = jax.random.split(key)
+    items: Step = ring.items
+    first = replay.draw(ring, shape, key_rows, skip=STEPS_WITHOUT_START * config.num_envs)
+    rows, taken = [first], [jnp.ones(shape, bool)]
+    for _ in range(config.return_steps - 1):
+        following = items.following[rows[-1]]
+        taken.append(taken[-1] & (following >= 0))
+        rows.append(jnp.where(taken[-1], following, rows[-1]))
+    last, steps = rows[-1], jnp.stack(rows, axis=-1)
+
+    in_ring, row, start = _address(items.previous[first])
+    from_start = starts[:, : components.num_seen][start]
+    observation = jnp.where(in_ring[..., None], items.state[row].astype(jnp.float32), from_start)
+    next_observation = items.state[last].astype(jnp.float32)
+    before = _features_left(components, items, starts, first)
+    variant = jnp.zeros(shape, jnp.int32)
+    if items.angle is not None:
+        variant = jax.random.randint(key_variant, shape, 0, 1 + config.yaw_copies)
+        angle = _chosen(items.angle[first], jnp.maximum(variant - 1, 0))
+        turned = (variant > 0)[..., None]
+        rotate = lambda state: jnp.where(turned, _rotated(components, state, angle), state)
+        observation, next_observation = rotate(observation), rotate(next_observation)
+    of_variant = jnp.broadcast_to(variant[..., None], steps.shape)
+    reached = _chosen(items.features[steps], of_variant[..., None], axis=-2)
+    left = jnp.concatenate(
+        [_chosen(before, variant[..., None], axis=-2)[..., None, :], reached[..., :-1, :]], axis=-2
+    )
+    return Experience(
+        observation=observation,
+        action=items.action[first],
+        next_observation=next_observation,
+        outcomes=Outcomes(
+            features=left,
+            next_features=reached,
+            bonus=items.bonus[steps],
+            terminated=items.terminated[steps],
+            distances=jax.tree.map(lambda x: _chosen(x[steps], of_variant), items.distances),
+            taken=jnp.stack(taken, axis=-1),
+        ),
+        row=first,
+    )
+
+
+def measure_all(
+    components: Components, reference: Reference, ring: Replay, starts: jax.Array
+) -> Replay:
+    """The replay with all its distances measured anew."""
+    items: Step = ring.items
+    every = jnp.arange(items.previous.shape[0])
+    before = _features_left(components, items, starts, every)
+    distances = measure(components, reference, before, items.features)
+    return ring._replace(items=items._replace(distances=distances))
+
+
+def measure(
+    components: Components, reference: Reference, before: jax.Array, after: jax.Array
+) -> Distances:
+    """Distances [...] of transitions whose ends have those features, [..., F] each."""
+    config = components.config
+
+    def distance(features):
+        dims = features.shape[-1]
+        nearest = knn_distances(
+            features.reshape(-1, dims),
+            reference.points[:, :dims],
+            config.num_neighbors,
+            count=reference.num_filled,
+        )
+        return nearest[:, -1].reshape(features.shape[:-1])
+
+    reached = distance(after)
+    if config.shaping == 0:
+        return Distances(reached, jnp.zeros_like(reached), jnp.zeros_like(reached))
+    if config.shaping_space == "features":
+        return Distances(reached, distance(before), reached)
+    potential, next_potential = distance(jnp.stack([before, after])[..., :POSITION_DIMS])
+    return Distances(reached, potential, next_potential)
+
+
+def _address(previous: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Whether an item stands before, its row if so, and the row in the starts if not."""
+    return previous >= 0, jnp.maximum(previous, 0), jnp.maximum(-1 - previous, 0)
+
+
+def _features_left(
+    components: Components, items: Step, starts: jax.Array, rows: jax.Array
+) -> jax.Array:
+    """[..., V, F] of the states that the items in `rows` [...] left."""
+    in_ring, row, start = _address(items.previous[rows])
+    if items.angle is None and rows.size > starts.shape[0]:
+        of_start = components.phi(starts)[start][..., None, :]
+    else:
+        angle = None if items.angle is None else items.angle[rows]
+        of_start = _variants(components, starts[start], angle)
+    return jnp.where(in_ring[..., None, None], items.features[row], of_start)
+
+
+def _variants(components: Components, state: jax.Array, angle: jax.Array | None) -> jax.Array:
+    """Features [..., V, F] of states [..., D] and their copies."""
+    features = components.phi(state)[..., None, :]
+    if angle is None:
+        return features
+    turned = components.phi(_rotated(components, state[..., None, :], angle))
+    return jnp.concatenate([features, turned], axis=-2)
+
+
+def _rotated(components: Components, state: jax.Array, angle: jax.Array) -> jax.Array:
+    assert components.torso is not None  # checked by Config
+    state = jnp.broadcast_to(state, (*angle.shape, state.shape[-1]))
+    return components.torso.rotate(state, angle)
+
+
+def _chosen(values: jax.Array, index: jax.Array, axis: int = -1) -> jax.Array:
+    """The entry of that index along an axis, which goes."""
+    return jnp.take_along_axis(values, jnp.expand_dims(index, axis), axis).squeeze(axis)
+
+
+def _encoded(components: Components, state: jax.Array) -> jax.Array:
+    dtype, seen = components.config.replay_dtype, state[..., : components.num_seen]
+    if dtype == "float32":
+        return seen
+    largest = jnp.finfo(dtype).max
+    return jnp.clip(seen, -largest, largest).astype(dtype)

@@ -1,0 +1,318 @@
+"""One step of all envs with its gradient steps, against the reward of the moment."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from maxent_jax import rewards
+from maxent_jax.algorithm import experience
+from maxent_jax.algorithm.experience import Reference
+from maxent_jax.algorithm.methods import Method
+from maxent_jax.components import Components
+from maxent_jax.density import histogram, reservoir
+from maxent_jax.density.reservoir import Reservoir
+from maxent_jax.envs import base
+from maxent_jax.envs.base import Episodes
+from maxent_jax.intrinsic import Steps
+from maxent_jax.mixture.occupancy import Occupancy
+from maxent_jax.sac import agent as sac_agent
+from maxent_jax.sac import losses
+from maxent_jax.sac.agent import Agent
+from maxent_jax.sac.replay import Replay
+from maxent_jax.types import Experience, Metrics, Outcomes, Transition
+
+SMALLEST_SIZE = 1e-8  # of a bonus, as a standard deviation
+
+
+class Visits(NamedTuple):
+    """Every state met, as counts; they only grow."""
+
+    cells: jax.Array  # [bins, bins] int32
+    off_grid: jax.Array  # [] int32
+
+
+class Learner(NamedTuple):
+    """All that training within an iteration changes."""
+
+    agent: Agent
+    replay: Replay
+    place: jax.Array  # [N] int32, where the replay finds each env's state: see experience.Step
+    episodes: Episodes  # [N] of the agent; then, with the random baseline, [N] of that
+    memory: jax.Array | None  # [N, T, F] states of each episode so far, for an episodic term
+    bonus: Any  # the bonus's state; None without one
+    reference: Reference
+    history: Reservoir
+    visits: Visits
+    random_visits: Visits
+    env_steps: jax.Array  # [] int32, of the agent
+    gradient_steps: jax.Array  # [] int32
+
+
+def init(components: Components, key: jax.Array) -> Learner:
+    """A fresh learner with fresh episodes, an empty replay, and no reference yet."""
+    config, sac = components.config, components.sac
+    key_agent, key_episodes, key_bonus = jax.random.split(key, 3)
+    num_rows = config.num_envs * (2 if config.random_baseline else 1)
+    dims = len(components.phi.names)
+    episodes = base.init(components.env, num_rows, config.num_starts, key_episodes)
+    episodic = components.bonus and components.bonus.episodic
+    remembered = episodic.size if episodic else dims
+    memory = None
+    if config.episodic_weight > 0 or episodic:
+        memory = jnp.zeros((config.num_envs, config.episode_length, remembered))
+    zero = jnp.zeros((), jnp.int32)
+    unvisited = Visits(jnp.zeros(components.grid.bins, jnp.int32), zero)
+    return Learner(
+        agent=sac_agent.init(sac, key_agent),
+        replay=experience.init(components),
+        place=-1 - episodes.start[: config.num_envs],
+        episodes=episodes,
+        memory=memory,
+        bonus=components.bonus.init(key_bonus) if components.bonus else None,
+        reference=Reference(jnp.zeros((config.reference_size, dims)), zero),
+        history=reservoir.init(config.reference_size, dims),
+        visits=unvisited,
+        random_visits=unvisited,
+        env_steps=zero,
+        gradient_steps=zero,
+    )
+
+
+def step(
+    components: Components, method: Method, learner: Learner, key: jax.Array
+) -> tuple[Learner, Metrics]:
+    """All envs once, then the gradient steps that go with it. Metrics named num_ are counts."""
+    config = components.config
+    key_act, key_random, key_env, key_history, key_yaw, key_learn = jax.random.split(key, 6)
+
+    policy = learner.agent.parameters.policy
+    observation = learner.episodes.env.obs[: config.num_envs]
+    action = sac_agent.act(components.sac, policy, observation, key_act)
+    if config.random_baseline:
+        random = jax.random.uniform(key_random, action.shape, minval=-1.0, maxval=1.0)
+        action = jnp.concatenate([action, random])
+    age = learner.episodes.age[: config.num_envs]
+    episodes, everyone = base.step(
+        components.env, learner.episodes, action, config.episode_length, key_env
+    )
+    transition = jax.tree.map(lambda x: x[: config.num_envs], everyone)
+    others = jax.tree.map(lambda x: x[config.num_envs :], everyone)
+
+    features = components.phi(transition.next_observation)
+    history = reservoir.add(learner.history, features, transition.valid, key_history)
+    reference = _refreshed(components, method, learner, history)
+    bonus, memory, novelty = _episodic(components, learner, transition, features, age)
+    ring, rows = experience.add(
+        components, reference, learner.replay, transition, learner.place, novelty, key_yaw
+    )
+    ended = transition.terminated | transition.truncated
+    learner = learner._replace(
+        agent=sac_agent.see(components.sac, learner.agent, observation, transition.valid),
+        replay=ring,
+        place=jnp.where(ended, -1 - episodes.start[: config.num_envs], rows),
+        episodes=episodes,
+        memory=memory,
+        bonus=bonus,
+        reference=reference,
+        history=history,
+        visits=visit(components, learner.visits, transition.next_observation, transition.valid),
+        random_visits=visit(
+            components, learner.random_visits, others.next_observation, others.valid
+        ),
+        env_steps=learner.env_steps + config.num_envs,
+        gradient_steps=learner.gradient_steps + config.updates_per_vector_step,
+    )
+    learner, metrics = _learn(components, method, learner, key_learn)
+    if components.torso is not None:
+        flipped = components.torso.flipped(transition.next_observation)
+        metrics["flipped_share"] = jnp.mean(flipped.astype(jnp.float32))
+    reached = ring.items.distances.reached.at[rows, 0].get(mode="fill", fill_value=1.0)
+    num_valid = jnp.maximum(jnp.sum(transition.valid), 1)
+    metrics |= {
+        "step_reward": jnp.sum(unshaped_reward(components, reached) * transition.valid) / num_valid,
+        "num_deaths": jnp.sum(transition.terminated, dtype=jnp.int32),
+        "num_time_limits": jnp.sum(transition.truncated, dtype=jnp.int32),
+        "num_invalid": jnp.sum(~everyone.valid, dtype=jnp.int32),
+    }
+    return learner, metrics
+
+
+def unshaped_reward(components: Components, distance: jax.Array) -> jax.Array:
+    """r_t of a state at that distance, [...] -> [...]: what scores and plots use."""
+    config = components.config
+    return rewards.of_distance(
+        distance, config.reward, config.reward_distance, len(components.phi.names)
+    )
+
+
+def reward(components: Components, outcomes: Outcomes) -> jax.Array:
+    """What SAC is paid for each step, [...]: r_t, shaping, the episodic term, and for living."""
+    config = components.config
+    distances = outcomes.distances
+    paid = unshaped_reward(components, distances.reached) + config.episodic_weight * outcomes.bonus
+    if config.shaping > 0:
+        paid = rewards.shaped(
+            paid,
+            potential=config.shaping * unshaped_reward(components, distances.potential),
+            next_potential=config.shaping * unshaped_reward(components, distances.next_potential),
+            discount=config.discount,
+            alive=1.0 - outcomes.terminated,
+            survives_death=config.shaping_survives_death,
+        )
+    return config.reward_scale * paid + _for_living(components, outcomes)
+
+
+def _for_living(components: Components, outcomes: Outcomes) -> jax.Array:
+    return components.config.alive_bonus * (1.0 - outcomes.terminated)
+
+
+def returns(outcomes: Outcomes, paid: jax.Array, discount: float) -> tuple[jax.Array, jax.Array]:
+    """The discounted sum of what was paid, [...], and the factor on γ V(s') beyond, [...].
+
+    With n steps the entropy of the policy counts from the last state on, as usual in n-step SAC.
+
+    Args:
+      paid: [..., n].
+      discount: γ.
+    """
+    taken = outcomes.taken.astype(jnp.float32)
+    before = jax.lax.broadcasted_iota(jnp.float32, paid.shape, paid.ndim - 1)
+    terminated = jnp.any(outcomes.terminated & outcomes.taken, axis=-1)
+    beyond = discount ** (jnp.sum(taken, -1) - 1) * (1.0 - terminated)
+    return jnp.sum(paid * taken * discount**before, axis=-1), beyond
+
+
+def _refreshed(
+    components: Components, method: Method, learner: Learner, history: Reservoir
+) -> Reference:
+    """The reference, drawn anew where the method's period says so.
+
+    The mixture's own states change only between iterations, see algorithm.begin.
+    """
+    vector_step = learner.env_steps // components.config.num_envs
+    period = method.refresh_period
+    due = _changes_within_iteration(method) & (vector_step % jnp.maximum(period, 1) == 0)
+    return Reference(
+        jnp.where(due, history.points, learner.reference.points),
+        jnp.where(due, reservoir.count(history), learner.reference.num_filled),
+    )
+
+
+def _changes_within_iteration(method: Method) -> jax.Array:
+    return method.from_history & (method.refresh_period > 0)
+
+
+def _episodic(components, learner, transition: Transition, features, age):
+    """The bonus, the memory with the states left behind, and the episodic term of those reached."""
+    config, bonus, memory = components.config, learner.bonus, learner.memory
+    if memory is None:
+        return bonus, memory, jnp.zeros(config.num_envs)
+    rows, left = jnp.arange(config.num_envs), components.phi(transition.observation)
+    if components.bonus is None:
+        memory = memory.at[rows, age].set(left)
+        novelty = rewards.episodic_bonus(features, memory, age + 1, config.num_neighbors)
+        return bonus, memory, novelty
+    episodic = components.bonus.episodic
+    memory = memory.at[rows, age].set(episodic.embed(bonus, left))
+    embedded = episodic.embed(bonus, features)
+    bonus, novelty = episodic.novelty(bonus, embedded, memory, age + 1)
+    return bonus, memory, novelty
+
+
+def visit(components: Components, visits: Visits, states: jax.Array, counts: jax.Array) -> Visits:
+    """With the states [B, D] that count, [B] bool."""
+    number = counts.astype(jnp.int32)
+    cells = histogram.count(states, components.grid, number)
+    return Visits(visits.cells + cells, visits.off_grid + jnp.sum(number) - jnp.sum(cells))
+
+
+def _learn(
+    components: Components, method: Method, learner: Learner, key: jax.Array
+) -> tuple[Learner, Metrics]:
+    """The gradient steps of one step of all envs, on rewards of the current reference."""
+    config = components.config
+    shape = (config.updates_per_vector_step, config.batch_size)
+    key_sample, key_update = jax.random.split(key)
+    drawn = experience.sample(
+        components, learner.replay, learner.episodes.starts.obs, shape, key_sample
+    )
+    # Stored distances hold while the reference does; the branch touches the drawn rows alone.
+    distances = jax.lax.cond(
+        _changes_within_iteration(method) & (not config.stale_rewards),
+        lambda x: experience.measure(components, learner.reference, x.features, x.next_features),
+        lambda x: x.distances,
+        drawn.outcomes,
+    )
+    outcomes = drawn.outcomes._replace(distances=distances)
+    of_bonus: Metrics = {}
+    if components.bonus is None:
+        bonus, paid = learner.bonus, reward(components, outcomes)
+    else:
+        key_bonus = jax.random.fold_in(key, 2)
+        bonus, paid, of_bonus = _paid_by_bonus(components, learner, drawn, key_bonus)
+    total, beyond = returns(outcomes, paid, config.discount)
+    batches = losses.Batch(drawn.observation, drawn.action, total, drawn.next_observation, beyond)
+
+    def update(agent, batch_and_key):
+        return sac_agent.update(components.sac, agent, *batch_and_key)
+
+    keys = jax.random.split(key_update, shape[0])
+    agent, metrics = jax.lax.scan(update, learner.agent, (batches, keys))
+    metrics = jax.tree.map(jnp.mean, metrics | of_bonus)
+    metrics |= {
+        "replay_reward": jnp.mean(unshaped_reward(components, distances.reached[..., 0])),
+        "replay_paid": jnp.mean(paid[..., 0]),
+        "replay_bonus": jnp.mean(outcomes.bonus[..., 0]),
+    }
+    return learner._replace(agent=agent, bonus=bonus), metrics
+
+
+def _paid_by_bonus(
+    components: Components, learner: Learner, drawn: Experience, key: jax.Array
+) -> tuple[Any, jax.Array, Metrics]:
+    """The bonus once it has learned from what was drawn, what it paid for it before, [..., 1], and
+    what it says of itself.
+
+    It sees features, as every other reward does. What it pays is divided by its standard deviation
+    over all that was drawn: methods say nothing of a scale, which SAC's temperature needs.
+    """
+    payer = components.bonus
+    assert payer is not None
+    key_value, key_learn = jax.random.split(key)
+    parameters, outcomes = learner.agent.parameters, drawn.outcomes
+    steps = Steps(
+        observation=outcomes.features[..., 0, :],
+        action=drawn.action,
+        next_observation=outcomes.next_features[..., 0, :],
+        value=sac_agent.value(components.sac, parameters, drawn.next_observation, key_value),
+        episodic=outcomes.bonus[..., 0],
+        row=drawn.row,
+        cell=_cells(components, drawn.next_observation),
+    )
+    together = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps)
+    bonus, found = payer.reward(learner.bonus, together)
+    size = jnp.std(found)
+    paid = components.config.reward_scale * found / jnp.maximum(size, SMALLEST_SIZE)
+
+    def learn(bonus, batch_and_key):
+        return payer.learn(bonus, *batch_and_key)
+
+    keys = jax.random.split(key_learn, steps.value.shape[0])
+    bonus, metrics = jax.lax.scan(learn, bonus, (steps, keys))
+    paid = paid.reshape(*steps.value.shape, 1) + _for_living(components, outcomes)
+    return bonus, paid, metrics | {"bonus_size": size}
+
+
+def _cells(components: Components, states: jax.Array) -> jax.Array:
+    flat = states.reshape(-1, states.shape[-1])
+    return histogram.cells(flat, components.grid).reshape(states.shape[:-1])
+
+
+def refresh_bonus(components: Components, bonus: Any, visited: Occupancy) -> Any:
+    """The bonus with the states that the mixture visits, where it asks for them."""
+    if components.bonus is None or components.bonus.refresh is None:
+        return bonus
+    return components.bonus.refresh(
+        bonus, histogram.count(visited.states, components.grid, visited.weight)
+    )

@@ -1,0 +1,13 @@
+"""What a run has learned: its metrics, policies, fresh episodes, datasets and exported policies."""
+
+from maxent_jax.analysis.run import (
+    Paths,
+    Run,
+    Summary,
+    load_run,
+    mean_end_distances,
+    mean_ends,
+    paths,
+)
+
+__all__ = ["Paths", "Run", "Summary", "load_run", "mean_end_distances", "mean_ends", "paths"]

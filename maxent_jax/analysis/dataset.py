@@ -1,0 +1,103 @@
+"""Transitions of a mixture's episodes, for offline reinforcement learning."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from maxent_jax import mixture
+from maxent_jax.checks import check_whole
+from maxent_jax.components import Components
+from maxent_jax.config import Config
+from maxent_jax.mixture import Archive, occupancy
+from maxent_jax.runs import memory
+
+EPISODES_AT_ONCE = 32
+
+
+def check(config: Config, num: int) -> None:
+    """Whether that many transitions can be collected.
+
+    Raises:
+      ValueError: num < 1, or more than fit into memory.
+    """
+    if check_whole("n", num) < 1:
+        raise ValueError(f"a dataset has at least 1 transition, not {num}")
+    memory.check_rows(config, num, "transitions")
+
+
+def collect(
+    components: Components, archive: Archive, weights: jax.Array, num: int, key: jax.Array
+) -> dict[str, np.ndarray]:
+    """`num` transitions, episode by episode; each is played by one policy, drawn by weight.
+
+    | key               | shape, type   | what                                                     |
+    |-------------------|---------------|----------------------------------------------------------|
+    | observations      | [n, D] float32| the state left                                           |
+    | actions           | [n, A] float32| in [-1, 1], of the share `torque_limit` of the controls  |
+    | next_observations | [n, D] float32| the state reached, also at an episode's end              |
+    | terminals         | [n] bool      | the state reached ended its episode: no return from there|
+    | timeouts          | [n] bool      | the episode was cut after it, see below                  |
+    | policy            | [n] int32     | who played                                               |
+    | features          | [n, F] float32| phi of the state reached                                 |
+
+    An episode is cut at its time limit, before a step that leaves the finite numbers, and at the
+    last row. Every episode's last row is a terminal or a timeout, and no other row is either.
+
+    There is no reward, as there is none in the run. To give it one, rate the states reached, with
+    `rewards.knn_reward(features, ...)` or a task of your own on `next_observations`.
+
+    Args:
+      weights: [P], of the policies.
+      num: n. Beside the rows, EPISODES_AT_ONCE episodes are in memory.
+    Raises:
+      ValueError: num < 1, or no episode has a first step.
+    """
+    check(components.config, num)
+    rows: dict[str, np.ndarray] = {}
+    filled = 0
+    while filled < num:
+        key, key_episodes = jax.random.split(key)
+        found = _in_order(*_episodes(components, archive, weights, key_episodes))
+        if not rows:
+            rows = {name: np.empty((num, *x.shape[1:]), x.dtype) for name, x in found.items()}
+        taken = min(num - filled, len(found["policy"]))
+        if taken == 0:
+            raise ValueError(f"none of {EPISODES_AT_ONCE} episodes has a finite first step")
+        for name, x in found.items():
+            rows[name][filled : filled + taken] = x[:taken]
+        filled += taken
+    rows["timeouts"][-1] = not rows["terminals"][-1]
+    return rows
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _episodes(
+    components: Components, archive: Archive, weights: jax.Array, key: jax.Array
+) -> tuple[dict[str, jax.Array], jax.Array]:
+    """[T, E, ...] of each key, and [T, E] bool: which are transitions at all."""
+    key_starts, key_assign, key_order, key_play = jax.random.split(key, 4)
+    starts = jax.vmap(components.env.reset)(jax.random.split(key_starts, EPISODES_AT_ONCE))
+    offset = jax.random.uniform(key_assign)
+    policy = mixture.assign_episodes(weights, EPISODES_AT_ONCE, offset)
+    # The last ones may be cut off: they must not always be the newest policies'.
+    policy = jax.random.permutation(key_order, policy)
+    reached = occupancy.play(components, archive, policy, starts, key_play)
+    goes_on = jnp.concatenate([reached.alive[1:], jnp.zeros_like(reached.alive[:1])])
+    rows = {
+        "observations": jnp.concatenate([starts.obs[None], reached.states[:-1]]),
+        "actions": reached.actions,
+        "next_observations": reached.states,
+        "terminals": reached.terminated,
+        "timeouts": ~goes_on & ~reached.terminated,
+        "policy": jnp.broadcast_to(policy, reached.alive.shape),
+        "features": components.phi(reached.states),
+    }
+    return rows, reached.alive
+
+
+def _in_order(rows: dict[str, jax.Array], there: jax.Array) -> dict[str, np.ndarray]:
+    """[R, ...] of each key: one episode after the other."""
+    mask = np.asarray(there).T
+    return {name: np.asarray(x).swapaxes(0, 1)[mask] for name, x in rows.items()}

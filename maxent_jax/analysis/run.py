@@ -1,0 +1,325 @@
+"""A finished or running run, loaded to be looked at."""
+
+import dataclasses
+import functools
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.export import Exported
+
+from maxent_jax import components, errors, mixture
+from maxent_jax.algorithm import methods
+from maxent_jax.analysis import dataset, export
+from maxent_jax.checks import check_path, check_whole
+from maxent_jax.components import Components
+from maxent_jax.config import Config
+from maxent_jax.config.names import CORRECTIVE
+from maxent_jax.density import histogram
+from maxent_jax.mixture import Archive, occupancy
+from maxent_jax.mixture.occupancy import Occupancy, Scores
+from maxent_jax.precision import in_32_bits
+from maxent_jax.runs import checkpoint, files, integrity, memory
+from maxent_jax.sac import agent
+from maxent_jax.sac.agent import Policy
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+
+class Paths(NamedTuple):
+    """Episodes of single policies."""
+
+    states: np.ndarray  # [E, T, D]
+    alive: np.ndarray  # [E, T] bool: the state was reached before the episode's end
+    policy: np.ndarray  # [E] int, ascending
+
+
+class Summary(NamedTuple):
+    """What a policy does in fresh episodes, under the reward that the mixture defines."""
+
+    policy: int
+    weight: float
+    episode_return: float
+    step_reward: float
+    episode_length: float  # mean, steps
+    mean_end: list[float]  # on the grid's axes
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """One seed of a run. `metrics` are columns with one entry an iteration, [T] or [T, ...]."""
+
+    path: Path
+    config: Config
+    metrics: dict[str, np.ndarray]
+    seed: int
+    mixture: Archive
+    histogram: np.ndarray  # [bins, bins] states met in training
+    random_histogram: np.ndarray  # [bins, bins] states met by the random policy beside it
+
+    @property
+    def num_policies(self) -> int:
+        """Policies in the mixture, the untrained one included."""
+        return int(self.mixture.size)
+
+    @property
+    def weights(self) -> np.ndarray:
+        """[P] of the mixture's policies, 0 for empty slots."""
+        if self.config.weights == CORRECTIVE and len(self.metrics.get("mixture_weights", ())):
+            return self.metrics["mixture_weights"][-1].astype(np.float32)
+        return np.asarray(methods.make(self.config).weights[self.num_policies - 1])
+
+    @property
+    def components(self) -> Components:
+        """The environment, the networks and the feature map of the run."""
+        return components.make(self.config)
+
+    def frame(self) -> "DataFrame":
+        """The metrics as a pandas frame: a row an iteration, a column a number.
+
+        A metric of more numbers has a column for each, `weights_0`, `weights_1`, ...
+
+        Raises:
+          ImportError: there is no pandas.
+        """
+        try:
+            from pandas import DataFrame
+        except ImportError:
+            raise ImportError("Run.frame needs pandas: pip install pandas.") from None
+        return DataFrame(_scalar_columns(self.metrics))
+
+    @in_32_bits
+    def features(self, states: jax.Array | np.ndarray) -> jax.Array:
+        """phi(s), where distances are taken: [..., D] -> [..., F]; see `components.phi.names`."""
+        return self.components.phi(jnp.asarray(states))
+
+    def policy(self, index: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
+        """Policy `index` as a function: state [..., D], key -> action [..., A] in [-1, 1].
+
+        Raises:
+          IndexError: no such policy.
+        The function raises ValueError where a state is not [..., D].
+        """
+        return functools.partial(_act, self.components, self._policy(index))
+
+    @in_32_bits
+    def act(self, s: jax.Array, key: jax.Array, policy: int | None = None) -> jax.Array:
+        """Actions [..., A] for states [..., D] by one policy, drawn by weight unless named.
+
+        The mixture keeps the policy that it has drawn for a whole episode: to play it, draw once.
+        """
+        key_draw, key_act = jax.random.split(key)
+        if policy is None:
+            policy = int(jax.random.choice(key_draw, self.weights.shape[0], p=self.weights))
+        return self.policy(policy)(s, key_act)
+
+    def export_policy(self, index: int, deterministic: bool = False) -> Exported:
+        """Policy `index` for use without this package: see export.policy for how it is called.
+
+        Raises:
+          IndexError: no such policy.
+        """
+        return export.policy(self.components.sac, self._policy(index), deterministic)
+
+    @in_32_bits
+    def occupancy(self, episodes_per_policy: int = 5, seed: int = 0) -> Occupancy:
+        """Fresh episodes of each policy, with each state's share of the mixture's occupancy.
+
+        Raises:
+          ValueError: episodes_per_policy < 1, or more than fit into memory.
+        """
+        check_whole("episodes_per_policy", episodes_per_policy, least=1)
+        memory.check_episodes(self.config, episodes_per_policy * self.num_policies)
+        key_starts, key_play = jax.random.split(jax.random.key(seed))
+        num_episodes = episodes_per_policy * self.num_policies
+        by_policy = self._components_by_policy
+        starts = jax.vmap(by_policy.env.reset)(jax.random.split(key_starts, num_episodes))
+        weights = jnp.asarray(self.weights)
+        return _of_mixture(by_policy, self.mixture, weights, starts, key_play)
+
+    @in_32_bits
+    def occupancy_of(self, episodes: Paths) -> Occupancy:
+        """The same of episodes that were played elsewhere, at least one of each policy.
+
+        Raises:
+          ValueError: a policy without an episode, or one that is not in the mixture.
+        """
+        played = set(np.unique(episodes.policy).tolist())
+        if played != set(range(self.num_policies)):
+            raise ValueError(
+                f"episodes are of the policies {sorted(played)}, but must be of all from 0 to "
+                f"{self.num_policies - 1}"
+            )
+        states = jnp.asarray(episodes.states).swapaxes(0, 1)
+        alive = jnp.asarray(episodes.alive).T
+        policy, none = jnp.asarray(episodes.policy, jnp.int32), jnp.zeros((), jnp.int32)
+        weights = jnp.asarray(self.weights)
+        return _of_episodes(self._components_by_policy, weights, policy, states, alive, none)
+
+    def rollout(self, episodes_per_policy: int = 5, seed: int = 0) -> Paths:
+        """Fresh episodes of each policy, as paths."""
+        return paths(self.occupancy(episodes_per_policy, seed))
+
+    @in_32_bits
+    def dataset(self, n: int, seed: int = 0) -> dict[str, np.ndarray]:
+        """`n` transitions of fresh episodes of the mixture, for offline reinforcement learning.
+
+        `np.savez_compressed(path, **run.dataset(n))` saves them. See dataset.collect for the keys.
+
+        Raises:
+          ValueError: n < 1, or more than fit into memory.
+        """
+        dataset.check(self.config, n)
+        weights, key = jnp.asarray(self.weights), jax.random.key(seed)
+        return dataset.collect(self.components, self.mixture, weights, n, key)
+
+    @in_32_bits
+    def scores(self, visited: Occupancy, seed: int = 0) -> Scores:
+        """Each policy's return under the reward that these states of the mixture define."""
+        rows = mixture.draw_rows(visited.weight, self.config.reference_size, jax.random.key(seed))
+        return _score(self.components, visited, visited.features[rows], rows, self.mixture)
+
+    def summaries(self, visited: Occupancy, seed: int = 0) -> list[Summary]:
+        """One for each policy, of the episodes in `visited`."""
+        episodes, scores, weights = paths(visited), self.scores(visited, seed), self.weights
+        ends = mean_ends(self, episodes)
+        return [
+            Summary(
+                policy=i,
+                weight=float(weights[i]),
+                episode_return=float(scores.episode_return[i]),
+                step_reward=float(scores.step_reward[i]),
+                episode_length=float(episodes.alive[episodes.policy == i].sum(1).mean()),
+                mean_end=ends[i].tolist(),
+            )
+            for i in range(self.num_policies)
+        ]
+
+    @in_32_bits
+    def measures(self, visited: Occupancy, seed: int = 0) -> dict[str, float]:
+        """Coverage and entropies of the mixture, named as in the metrics."""
+        measured = occupancy.measures(self.components, visited, jax.random.key(seed))
+        return {name: value.item() for name, value in measured.items()}
+
+    @property
+    def _components_by_policy(self) -> Components:
+        """With which policies play equally often, and the states of each share its weight."""
+        return components.make(dataclasses.replace(self.config, pooled=False, mixing="episode"))
+
+    def _policy(self, index: int) -> Policy:
+        check_whole("policy", index)
+        if not -self.num_policies <= index < self.num_policies:
+            raise IndexError(
+                f"policy is {index}, but the mixture has {self.num_policies}: choose from 0 to "
+                f"{self.num_policies - 1}"
+            )
+        return mixture.policy(self.mixture, jnp.asarray(index % self.num_policies)).policy
+
+
+@in_32_bits
+def _act(components: Components, policy: Policy, states: jax.Array, key: jax.Array) -> jax.Array:
+    size = components.sac.observation_size
+    if jnp.shape(states)[-1:] != (size,):
+        raise ValueError(f"states have shape {jnp.shape(states)}, but must be [..., {size}]")
+    return agent.act(components.sac, policy, jnp.asarray(states, jnp.float32), key)
+
+
+_of_mixture = jax.jit(occupancy.of_mixture, static_argnums=0)
+_of_episodes = jax.jit(occupancy.of_episodes, static_argnums=0)
+_score = jax.jit(occupancy.score, static_argnums=0)
+
+
+def paths(visited: Occupancy) -> Paths:
+    """The episodes that an occupancy was made of."""
+    num_episodes = visited.episode_policy.shape[0]
+    states = np.asarray(visited.states).reshape(-1, num_episodes, visited.states.shape[-1])
+    alive = np.asarray(visited.alive).reshape(-1, num_episodes)
+    return Paths(np.moveaxis(states, 0, 1), alive.T, np.asarray(visited.episode_policy))
+
+
+@in_32_bits
+def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> Run:
+    """Loads the results of a run as of its last checkpoint; the replay stays on disk.
+
+    Args:
+      path: the run's directory.
+      seed_index: which of the seeds that were trained side by side.
+      fallback: pass over damaged checkpoints, with a warning for each.
+    Raises:
+      RunError: not the directory of a run, or no such seed.
+      CheckpointError: no complete checkpoint.
+      CheckpointCorruptError: a file of it is not what was written.
+      TypeError: a path or an index of the wrong type.
+    """
+    directory = check_path("path", path)
+    seed_index = check_whole("seed_index", seed_index)
+    config = files.read_config(directory)
+    if not 0 <= seed_index < config.num_seeds:
+        raise errors.RunError(
+            f"seed_index is {seed_index}, but {directory} has {config.num_seeds} "
+            f"{'seed' if config.num_seeds == 1 else 'seeds'}, counted from 0."
+        )
+    name, passed_over = integrity.find(directory, whole=False, fallback=fallback)
+    for sentence in passed_over.values():
+        warnings.warn(sentence, stacklevel=2)
+    results = checkpoint.restore_results(directory, name, config)
+    rows = checkpoint.read_progress(directory, name)[0].rows
+    if config.num_seeds > 1:
+        results = jax.tree.map(lambda x: x[seed_index], results)
+        rows = [_of_seed(row, seed_index) for row in rows]
+    return Run(
+        path=directory,
+        config=config,
+        metrics={name: _column(rows, name) for name in rows[0]} if rows else {},
+        seed=config.seed + seed_index,
+        mixture=results.archive,
+        histogram=np.asarray(results.visits.cells),
+        random_histogram=np.asarray(results.random_visits.cells),
+    )
+
+
+def mean_ends(run: Run, episodes: Paths) -> np.ndarray:
+    """[P, 2]: the mean of where the episodes of each policy end, on the grid's axes."""
+    ends = _located_ends(run, episodes)
+    return np.stack([ends[episodes.policy == i].mean(axis=0) for i in range(run.num_policies)])
+
+
+def mean_end_distances(run: Run, episodes: Paths) -> np.ndarray:
+    """[P]: how far from their first state the episodes of each policy end, on the grid's axes."""
+    distance = np.linalg.norm(
+        _located_ends(run, episodes) - _locate(run, episodes.states[:, 0]), axis=1
+    )
+    return np.stack([distance[episodes.policy == i].mean() for i in range(run.num_policies)])
+
+
+def _located_ends(run: Run, episodes: Paths) -> np.ndarray:
+    last = episodes.alive.sum(axis=1) - 1
+    ends = episodes.states[np.arange(len(last)), np.maximum(last, 0)]
+    return _locate(run, ends)
+
+
+def _locate(run: Run, states: np.ndarray) -> np.ndarray:
+    return np.asarray(histogram.locate(jnp.asarray(states), run.components.grid))
+
+
+def _scalar_columns(metrics: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Metrics [T] as they are, and each entry of metrics [T, ...] by its name and indices."""
+    columns = {}
+    for name, values in metrics.items():
+        for index in np.ndindex(values.shape[1:]):
+            columns["_".join([name, *map(str, index)])] = values[:, *index]
+    return columns
+
+
+def _of_seed(row: dict[str, Any], index: int) -> dict[str, Any]:
+    return {k: v[index] if isinstance(v, list) else v for k, v in row.items()}
+
+
+def _column(rows: list[dict[str, Any]], name: str) -> np.ndarray:
+    values = np.array([row.get(name) for row in rows])
+    return values.astype(float) if values.dtype == object else values

@@ -1,0 +1,179 @@
+"""The values that a run's settings start from: of presets, in some environments, and of methods."""
+
+from typing import Any
+
+from maxent_jax.config.names import BASELINES, CLASSIC_ENVS
+
+_FAST_LEARNER: dict[str, Any] = dict(
+    critic_layer_norm=True,
+    learning_rate=1e-3,
+    return_steps=3,
+    initial_temperature=0.1,
+    restart_temperature=True,
+)
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "smoke": dict(
+        num_iterations=2,
+        steps_per_iteration=400,
+        updates_per_step=0.25,
+        num_envs=4,
+        num_segments=2,
+        episode_length=100,
+        num_starts=64,
+        reference_size=256,
+        mixture_episodes=8,
+        hidden_size=32,
+        batch_size=32,
+        replay_size=2_000,
+    ),
+    "quick": dict(
+        num_envs=64,
+        steps_per_iteration=120_000,
+        updates_per_step=0.25,
+        hidden_size=128,
+        **_FAST_LEARNER,
+        replay_size=240_000,
+    ),
+    "gpu": dict(
+        num_iterations=20,
+        num_envs=2048,
+        steps_per_iteration=2_048_000,
+        num_segments=20,
+        updates_per_step=1 / 64,
+        batch_size=4096,
+        **_FAST_LEARNER,
+        reference_size=131_072,
+        mixture_episodes=256,
+        random_baseline=False,
+    ),
+    "paper": dict(
+        num_iterations=20,
+        steps_per_iteration=150_000,
+        updates_per_step=1.0,
+        num_envs=16,
+        num_segments=25,
+        reward="paper",
+        episodic_weight=0.1,
+        leave_own_out=False,
+        reference_size=16_384,
+        mixture_episodes=64,
+    ),
+}
+
+_LOCOMOTION = dict(
+    shaping=100.0,
+    shaping_space="position",
+    lagrangian_entropy=True,
+    reward_distance=20.0,
+    reward_scale=8.0,
+)
+_CLASSIC = dict(episode_length=200)
+_ROBOTS: dict[str, dict[str, Any]] = {
+    "ant": dict(
+        torque_limit=0.4,
+        end_flipped=True,
+        policy_inputs="heading",
+        yaw_copies=1,
+        **_LOCOMOTION,
+    ),
+    "walker2d": dict(normalize_inputs=True, actor_average=1e-3, **_LOCOMOTION),
+    "humanoid": dict(
+        policy_inputs="heading",
+        yaw_copies=1,
+        alive_bonus=0.7,
+        target_entropy_scale=0.0,
+        actor_average=1e-3,
+        **_LOCOMOTION,
+    ),
+}
+_LONG: dict[str, Any] = dict(
+    num_envs=128,
+    steps_per_iteration=960_000,
+    replay_size=960_000,
+    snapshots=3,
+    mixture_episodes=64,
+)
+# An iteration has 15,000 gradient steps on Ant, 120,000 on Walker2d, 240,000 on Humanoid: enough to
+# learn to walk.
+_BUDGETS = {
+    "ant": dict(num_iterations=12, updates_per_step=0.125, random_baseline=False),
+    "walker2d": dict(num_iterations=3, updates_per_step=0.125, **_LONG),
+    # A random policy's steps cost as much as the agent's: here a quarter of the time.
+    "humanoid": dict(num_iterations=4, updates_per_step=0.25, random_baseline=False, **_LONG),
+}
+
+# What a preset does otherwise in some environment.
+IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
+    **{("quick", env): changes | _BUDGETS.get(env, {}) for env, changes in _ROBOTS.items()},
+    **{("gpu", env): dict(physics="fast", **changes) for env, changes in _ROBOTS.items()},
+    **{
+        ("gpu", env): dict(reference_size=32_768, reward_distance=0.1, **_CLASSIC)
+        for env in CLASSIC_ENVS
+    },
+    **{("paper", env): dict(reference_size=8_192, **_CLASSIC) for env in CLASSIC_ENVS},
+    **{
+        ("quick", env): dict(
+            steps_per_iteration=19_200,
+            reference_size=4_096,
+            reward_distance=0.1,
+            **_CLASSIC,
+        )
+        for env in CLASSIC_ENVS
+    },
+}
+
+# The learner of methods as their authors published them, and of the baselines, whatever the preset.
+PLAIN: dict[str, Any] = dict(shaping=0.0, return_steps=1)
+# Bonuses are divided by their deviation; the distance to the reference has its own scale instead.
+_AS_PUBLISHED: dict[str, Any] = PLAIN | dict(episodic_weight=0.0, reward_scale=1.0)
+OF_METHOD: dict[str, dict[str, Any]] = {
+    "h-official": _AS_PUBLISHED | dict(bonus="histogram", mixing="step", leave_own_out=False),
+    **{name: _AS_PUBLISHED | dict(bonus=name) for name in BASELINES},
+}
+
+# What a method does otherwise in some environment, by preset. From the best policy, V on Walker2d
+# only ever walks that policy's way (docs/learning.md).
+OF_METHOD_IN_ENV: dict[tuple[str, str, str], dict[str, Any]] = {
+    (preset, "walker2d", "v"): dict(start="scratch") for preset in ("quick", "gpu")
+}
+
+# What the paper does, and how a run that does otherwise says so.
+PAPER: dict[str, tuple[Any, str]] = {
+    "physics": ("reference", "the physics is simplified"),
+    "torque_limit": (1.0, "torques are limited to a share of the control range"),
+    "end_flipped": (False, "an episode also ends upside down"),
+    "end_unhealthy": (True, "an episode goes on where health fails"),
+    "policy_inputs": ("state", "networks see the state in the heading's frame"),
+    "yaw_copies": (0, "episodes turned by a random yaw are learned from too"),
+    "reward": ("paper", "the reward's form is not p log R"),
+    "reward_scale": (1.0, "the reward is scaled"),
+    "alive_bonus": (0.0, "a step alive is paid for"),
+    "stale_rewards": (False, "rewards are not those of the current reference"),
+    "shaping": (0.0, "the reward is shaped by a potential"),
+    "shaping_survives_death": (False, "the potential survives death: not policy-invariant"),
+    "pooled": (False, "the reference is drawn from the pooled states of the mixture"),
+    "snapshots": (1, "an iteration archives more than one policy"),
+    "bonus": ("none", "SAC is not paid by the distance to the reference"),
+    "mixing": ("episode", "a policy of the mixture is drawn for each step"),
+    "deterministic": (False, "policies are evaluated by their mean actions"),
+    "eta": (0.1, "η is not 0.1"),
+    "num_neighbors": (3, "k is not 3"),
+    "leave_own_out": (False, "policies are scored without their own states"),
+    "hidden_layers": (2, "networks do not have 2 hidden layers"),
+    "hidden_size": (256, "hidden layers are not 256 wide"),
+    "critic_layer_norm": (False, "critics have layer norm"),
+    "learning_rate": (3e-4, "Adam's rate is not 3e-4"),
+    "batch_size": (128, "the batch is not 128"),
+    "replay_size": (1_000_000, "the replay does not hold 1e6 transitions"),
+    "replay_dtype": ("float32", "states in the replay are rounded to 16 bits"),
+    "discount": (0.99, "γ is not 0.99"),
+    "return_steps": (1, "critics learn from returns of several steps"),
+    "soft_update_rate": (0.005, "the soft update is not 0.005"),
+    "initial_temperature": (0.2, "the temperature starts elsewhere than at 0.2"),
+    "target_entropy_scale": (1.0, "the target entropy is not minus the number of actions"),
+    "lagrangian_entropy": (False, "the soft return counts entropy from its target"),
+    "normalize_inputs": (False, "networks see inputs of mean 0 and deviation 1"),
+    "actor_average": (0.0, "an average of the actor over its updates is archived"),
+    "restart_temperature": (False, "the temperature restarts in each iteration"),
+}

@@ -1,0 +1,62 @@
+"""RE3: how far a state lies from its nearest in the batch, seen by a network that never learns.
+
+Seo et al. 2021, "State entropy maximization with random encoders for efficient exploration", arXiv
+2102.09430: log(1 + R), R the distance to the k-th nearest. Their off-policy code
+(github.com/younggyoseo/RE3, `rad_re3`) looks for the nearest in the whole replay, not in the batch,
+and pays R / std(R), without the logarithm. Their encoder is convolutional, with layer norm and tanh
+at its end; for states it is here what k-means MaxEnt's code compared itself with
+(github.com/axnedergaard/kme), two hidden layers and neither of those.
+"""
+
+import functools
+from typing import Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+
+from maxent_jax.config.names import NEIGHBORS
+from maxent_jax.intrinsic import particles, protocol
+from maxent_jax.intrinsic.protocol import (
+    EMBEDDING_SIZE,
+    HIDDEN_LAYERS,
+    HIDDEN_SIZE,
+    Bonus,
+    Setting,
+    Steps,
+)
+from maxent_jax.sac.networks import Mlp
+
+NUM_NEIGHBORS = NEIGHBORS["re3"]  # k of rad_re3/config.yaml
+
+
+class Re3(NamedTuple):
+    """The fixed part; the state is the encoder's weights."""
+
+    setting: Setting
+    encoder: Mlp
+
+
+def make(setting: Setting) -> Bonus:
+    """The reward log(1 + distance to the third nearest), positive."""
+    re3 = Re3(setting, Mlp(HIDDEN_LAYERS, HIDDEN_SIZE, EMBEDDING_SIZE))
+    return Bonus(
+        init=functools.partial(init, re3),
+        reward=functools.partial(reward, re3),
+        learn=protocol.no_learning,
+    )
+
+
+def init(re3: Re3, key: jax.Array) -> Any:
+    """A random encoder."""
+    return re3.encoder.init(key, jnp.zeros((1, re3.setting.observation_size)))
+
+
+def reward(re3: Re3, state: Any, steps: Steps) -> tuple[Any, jax.Array]:
+    """log(1 + R).
+
+    Raises:
+      ValueError: B <= 3.
+    """
+    inputs = protocol.scaled(re3.setting, steps.next_observation)
+    embedding = cast(jax.Array, re3.encoder.apply(state, inputs))
+    return state, jnp.log1p(particles.distances(embedding, steps.row, NUM_NEIGHBORS)[:, -1])

@@ -1,0 +1,85 @@
+"""VCSE: the entropy of states among those of the same value.
+
+Kim et al. 2023, "Accelerating reinforcement learning with value-conditional state entropy
+exploration", arXiv 2305.19476: ψ(n + 1) / D + log 2ε, where ε is the distance to the k-th nearest
+in the larger of the distances of states and of values, and n counts the values nearer than ε, after
+Kraskov, Stögbauer & Grassberger 2004. As in their code (github.com/kingdy2002/VCSE, `VCSE_SAC`),
+states are divided by D too, values normalised over the batch, and 1e-5 is added within the
+logarithm. Their k and n count the state itself; ours, as Kraskov's, do not. Their value is
+that of the mean action, by a critic of the task's reward alone; without such a reward it is the
+learner's own, of an action drawn, with its entropy.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import digamma
+
+from maxent_jax.config.names import NEIGHBORS
+from maxent_jax.density.knn import smallest_k
+from maxent_jax.intrinsic import particles, protocol
+from maxent_jax.intrinsic.protocol import Bonus, Setting, State, Steps
+
+NUM_NEIGHBORS = NEIGHBORS["vcse"]  # knn_k of VCSE_SAC/config/agent/sac.yaml
+LOG_OFFSET = 1e-5  # of their code
+VARIANCE_FLOOR = 1e-5  # of the values: that of their layer norm
+ROUNDING = 1e-6
+ROWS = 256  # states measured at once, so that memory grows with B and not with its square
+
+
+def make(setting: Setting) -> Bonus:
+    """The reward ψ(n + 1) / D + log(2ε + 1e-5), nats for each dimension, of either sign."""
+    return Bonus(
+        init=protocol.no_state,
+        reward=functools.partial(reward, setting),
+        learn=protocol.no_learning,
+    )
+
+
+def reward(setting: Setting, state: State, steps: Steps) -> tuple[State, jax.Array]:
+    """Of each state among the others of the batch.
+
+    Raises:
+      ValueError: B <= 12.
+    """
+    dims = setting.observation_size
+    states = protocol.scaled(setting, steps.next_observation) / dims
+    deviation = steps.value - jnp.mean(steps.value)
+    values = deviation / jnp.sqrt(jnp.mean(deviation**2) + VARIANCE_FLOOR)
+    distance, count = joint_neighbors(states, values, steps.row, NUM_NEIGHBORS)
+    spread = digamma(count.astype(jnp.float32) + 1) / dims
+    return state, spread + jnp.log(2 * distance + LOG_OFFSET)
+
+
+def joint_neighbors(
+    states: jax.Array, values: jax.Array, rows: jax.Array, num_neighbors: int
+) -> tuple[jax.Array, jax.Array]:
+    """What Kraskov's first estimator is made of, of each row among the others.
+
+    Args:
+      states: [B, F].
+      values: [B].
+      rows: [B] int32, equal for copies of one transition, which are no others.
+      num_neighbors: k.
+    Returns:
+      [B] ε, to the k-th nearest in max(distance of states, distance of values), or to the farthest
+      where copies leave fewer than k others; and [B] int32, how
+      many values lie nearer than ε.
+    Raises:
+      ValueError: B <= k.
+    """
+    particles.check(states.shape[0], num_neighbors)
+
+    def measure(one):
+        state, value, own = one
+        apart = jnp.sqrt(jnp.sum((states - state[None]) ** 2, axis=-1))
+        value_apart = jnp.abs(values - value)
+        other = rows != own
+        joint = jnp.where(other, jnp.maximum(apart, value_apart), jnp.inf)
+        distance = particles.filled(smallest_k(joint, num_neighbors))[-1]
+        # ε is often itself a distance of values, of which XLA may make another in its last bit.
+        nearer = value_apart < distance * (1 - ROUNDING)
+        return distance, jnp.sum(other & nearer, dtype=jnp.int32)
+
+    return jax.lax.map(measure, (states, values, rows), batch_size=ROWS)

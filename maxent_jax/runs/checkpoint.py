@@ -1,0 +1,264 @@
+"""A run at one moment on disk, and back: its whole state, its config, and what it has measured.
+
+A checkpoint is a folder, named by how far the run has come. It is made under another name and
+renamed once it is complete and sealed, so what bears its name and is not whole is damaged. Archive
+and visits are an item of their own, so that analysis neither loads nor reads the replay.
+"""
+
+import contextlib
+import functools
+import json
+import logging
+import math
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from orbax.checkpoint import v1 as ocp
+
+from maxent_jax import algorithm
+from maxent_jax.algorithm import State
+from maxent_jax.algorithm.training import Visits
+from maxent_jax.config import Config
+from maxent_jax.errors import CheckpointError, SaveError
+from maxent_jax.mixture import Archive
+from maxent_jax.runs import files, integrity
+from maxent_jax.runs.integrity import ARRAYS, FOLDER, UNFINISHED
+
+CHECKPOINTS_KEPT = 2
+# In a checkpoint's folder, beside its config.json and metrics.jsonl:
+PROGRESS, PARTIAL = "progress.json", "partial.npz"
+
+
+class Progress(NamedTuple):
+    """What a run has measured so far, of which its metrics are made."""
+
+    rows: list[dict[str, Any]]  # one for each complete iteration, as in metrics.jsonl
+    begun: dict[str, np.ndarray] | None  # of the beginning of the next, if it has begun
+    segments: list[dict[str, np.ndarray]]  # of its segments so far
+    clock: dict[str, Any]  # seconds by name
+
+    @property
+    def name(self) -> str:
+        """Of the checkpoint: 3 after three iterations, 3+7 after seven segments of the next."""
+        return f"{len(self.rows)}" + ("" if self.begun is None else f"+{len(self.segments)}")
+
+
+class Results(NamedTuple):
+    """What analysis needs of a state. With several seeds, leaves have a leading axis [S, ...]."""
+
+    archive: Archive
+    visits: Visits
+    random_visits: Visits
+
+
+def save(run_directory: Path, state: State, progress: Progress, machine: dict[str, Any]) -> None:
+    """Writes a checkpoint whole or, to all who look, not at all. Older ones go.
+
+    With several processes each calls it, and writes its part of the arrays.
+
+    Args:
+      machine: that the state was computed on, beside the versions of its software.
+    Raises:
+      SaveError: it cannot be written; those before are intact.
+    """
+    folder = run_directory / FOLDER
+    temporary = (folder / f"{UNFINISHED}{progress.name}").absolute()
+    first = jax.process_index() == 0
+    try:
+        if first:
+            shutil.rmtree(temporary, ignore_errors=True)
+            temporary.mkdir(parents=True)
+        with _silence():
+            ocp.save_checkpointables(temporary / ARRAYS, _items(_stored(state)))
+        if first:
+            shutil.copy(run_directory / files.CONFIG, temporary)
+            files.write_metrics(temporary, progress.rows)
+            _write_progress(temporary, progress, machine)
+            integrity.seal(temporary)
+            shutil.rmtree(folder / progress.name, ignore_errors=True)
+            temporary.rename(folder / progress.name)
+            for old in integrity.checkpoints(run_directory)[:-CHECKPOINTS_KEPT]:
+                shutil.rmtree(folder / old)
+    except (OSError, ValueError, SaveError) as error:  # tensorstore's are ValueErrors
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise SaveError(
+            f"cannot save checkpoint {progress.name} of {run_directory}: {_reason(error)}; "
+            f"those before it are intact."
+        ) from error
+
+
+def read_progress(run_directory: Path, name: str) -> tuple[Progress, dict[str, Any]]:
+    """What that checkpoint's run had measured, and what it was computed with."""
+    folder = run_directory / FOLDER / name
+    content = json.loads((folder / PROGRESS).read_text(encoding="utf-8"))
+    begun, segments = None, []
+    if content["begun"]:
+        with np.load(folder / PARTIAL) as arrays:
+            parts = {key: arrays[key] for key in arrays.files}
+        begun = _beneath("begun/", parts)
+        segments = [_beneath(f"{i}/", parts) for i in range(content["segments"])]
+    rows = files.read_metrics(folder)
+    return Progress(rows, begun, segments, content["clock"]), content["computed_with"]
+
+
+def restore(run_directory: Path, name: str, config: Config, placed: State | None = None) -> State:
+    """The state of that checkpoint, on whatever devices it was saved from.
+
+    Args:
+      placed: the sharding of each leaf, see devices.placement; one device if left out.
+    Raises:
+      CheckpointError: it does not hold a state of this config.
+    """
+    shapes = _shapes(config)
+    items = _load(run_directory, name, _items(_abstract(shapes, placed)))
+    results, rest = items["results"], items["rest"]
+    learner = rest.learner._replace(visits=results.visits, random_visits=results.random_visits)
+    return _as_computed(rest._replace(archive=results.archive, learner=learner), shapes, placed)
+
+
+def restore_results(run_directory: Path, name: str, config: Config) -> Results:
+    """The archive and visits of that checkpoint, without the replay.
+
+    Raises:
+      CheckpointError: it does not hold results of this config.
+    """
+    abstract = {"results": _items(_abstract(_shapes(config)))["results"]}
+    return _load(run_directory, name, abstract)["results"]
+
+
+def _write_progress(folder: Path, progress: Progress, machine: dict[str, Any]) -> None:
+    parts = {f"begun/{key}": value for key, value in (progress.begun or {}).items()}
+    for i, segment in enumerate(progress.segments):
+        parts |= {f"{i}/{key}": value for key, value in segment.items()}
+    if progress.begun is not None:
+        np.savez(folder / PARTIAL, **parts)  # type: ignore[arg-type]
+    content = {
+        "begun": progress.begun is not None,
+        "segments": len(progress.segments),
+        "clock": progress.clock,
+        "computed_with": files.stack() | machine,
+    }
+    files.write_json(folder / PROGRESS, content)
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Orbax's threads print whole tracebacks of what it raises as well."""
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
+def _reason(error: Exception) -> str:
+    """In the system's words where they are known; TensorStore gives their number."""
+    code = re.search(r"os_error_code='(\d+)'", str(error))
+    if code:
+        return os.strerror(int(code[1]))
+    return getattr(error, "strerror", None) or str(error).splitlines()[0]
+
+
+def _beneath(prefix: str, parts: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {k.removeprefix(prefix): v for k, v in parts.items() if k.startswith(prefix)}
+
+
+def _items(state: State) -> dict[str, Any]:
+    learner = state.learner
+    return {
+        "results": Results(state.archive, learner.visits, learner.random_visits),
+        "rest": state._replace(
+            archive=None,  # type: ignore[arg-type]
+            learner=learner._replace(visits=None, random_visits=None),  # type: ignore[arg-type]
+        ),
+    }
+
+
+def _stored(state: State) -> State:
+    """What Orbax is given: it has no place for an array without elements, nor our kind of keys."""
+
+    def of_leaf(x: Any) -> Any:
+        if math.prod(x.shape) == 0:
+            return None
+        return jax.random.key_data(x) if _is_key(x) else x
+
+    return jax.tree.map(of_leaf, state)
+
+
+def _as_computed(stored: State, shapes: State, placed: State | None) -> State:
+    """The state again, of which `_stored` gave only a part."""
+    leaves, tree = jax.tree.flatten(shapes)
+    shardings = [None] * len(leaves) if placed is None else jax.tree.leaves(placed)
+    kept = iter(jax.tree.leaves(stored))
+
+    def of_leaf(shape: Any, sharding: Any) -> Any:
+        if math.prod(shape.shape) == 0:
+            return jnp.empty(shape.shape, shape.dtype, device=sharding)
+        found = next(kept)
+        return jax.random.wrap_key_data(found, impl=_key_impl(shape)) if _is_key(shape) else found
+
+    return jax.tree.unflatten(tree, map(of_leaf, leaves, shardings))
+
+
+def _is_key(x: Any) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _key_impl(shape: Any) -> Any:
+    return jax.random.key_impl(jnp.empty((), shape.dtype))
+
+
+def _shapes(config: Config) -> State:
+    return jax.eval_shape(lambda: algorithm.start(config))
+
+
+def _abstract(shapes: State, placed: State | None = None) -> State:
+    """What Orbax is to load, and where each array is to lie."""
+    if placed is None:
+        device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+        placed = jax.tree.map(lambda _: device, shapes)
+    # As `_stored`: its functions compute, and a shape has no values.
+    data = jax.eval_shape(
+        lambda state: jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, state),
+        shapes,
+    )
+    return jax.tree.map(
+        lambda x, sharding: (
+            None
+            if math.prod(x.shape) == 0
+            else jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)
+        ),
+        data,
+        placed,
+    )
+
+
+def _load(run_directory: Path, name: str, abstract: dict[str, Any]) -> dict[str, Any]:
+    path = (run_directory / FOLDER / name / ARRAYS).absolute()
+    saved = ocp.checkpointables_metadata(path).metadata
+    for item, expected in abstract.items():
+        # Orbax itself would turn another dtype into the one expected, and say nothing.
+        wrong = _arrays(saved[item]) ^ _arrays(expected)
+        if wrong:
+            array, shape, dtype = min(wrong)
+            raise CheckpointError(
+                f"checkpoint {name} of {run_directory} does not fit its config: see {array}, "
+                f"{dtype} of shape {shape}."
+            )
+    return ocp.load_checkpointables(path, abstract)
+
+
+def _arrays(tree: Any) -> set[tuple[str, tuple[int, ...], str]]:
+    """The name, shape and dtype of each."""
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    keystr = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
+    return {(keystr(path), tuple(x.shape), str(x.dtype)) for path, x in leaves if x is not None}

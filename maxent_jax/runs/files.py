@@ -1,0 +1,218 @@
+"""A run's directory: its config, its metrics, and where the rest lies. Loads no array library."""
+
+import contextlib
+import dataclasses
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from maxent_jax.config import Config
+from maxent_jax.errors import ConfigError, RunError, SaveError
+
+SCHEMA = 6  # of the directory, checkpoints included
+CONFIG, METRICS, FIGURES = "config.json", "metrics.jsonl", "figures"
+# All that any entry point writes there.
+WRITTEN = (
+    *(CONFIG, METRICS, FIGURES, "checkpoints", "evaluation.json"),
+    *("videos", "report.html", "tensorboard", "wandb"),
+)
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint")
+
+
+def stack() -> dict[str, str]:
+    """The versions that a run's bits depend on."""
+    versions = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return {"python": platform.python_version()} | versions
+
+
+def write_config(
+    directory: Path, config: Config, method: dict[str, Any], machine: dict[str, Any]
+) -> None:
+    """config.json: every setting, what departs from the paper, the stack and the machine."""
+    departures = {
+        name: {"value": getattr(config, name), "why": why}
+        for name, why in config.deviations().items()
+    }
+    content = {
+        "schema": SCHEMA,
+        "id": uuid.uuid4().hex[:12],
+        "config": dataclasses.asdict(config),
+        "method": method,
+        "deviations_from_the_paper": departures,
+        "budget": {
+            "env_steps": config.steps_per_iteration * config.num_iterations,
+            "gradient_steps": config.updates_per_vector_step
+            * config.vector_steps
+            * config.num_segments
+            * config.num_iterations,
+        },
+        "versions": stack(),
+        "machine": machine,
+    }
+    write_json(directory / CONFIG, content)
+
+
+def read_config(directory: Path) -> Config:
+    """The config of a run.
+
+    Raises:
+      RunError: no run there, or one of another schema.
+    """
+    path = directory / CONFIG
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        schema, settings = content["schema"], content["config"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise RunError(
+            f"{directory} is not the directory of a run: no readable {CONFIG}."
+        ) from None
+    if schema != SCHEMA:
+        raise RunError(f"{path} has schema {schema}, but this release reads schema {SCHEMA}.")
+    try:
+        return Config(**settings)
+    except (TypeError, ConfigError) as error:
+        raise RunError(f"{path} does not fit this release: {error}") from None
+
+
+def is_config(path: Path) -> bool:
+    """Whether a run may have written that file: any schema, or empty because the machine failed."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        return not text or {"schema", "config"} <= json.loads(text).keys()
+    except (OSError, ValueError, AttributeError):
+        return False
+
+
+def check_config(directory: Path, config: Config) -> None:
+    """Whether the run there has these settings, by whatever preset.
+
+    Raises:
+      RunError: it has not, or there is none.
+    """
+    saved = read_config(directory)
+    # A preset is a name for values that are compared one by one.
+    names = [field.name for field in dataclasses.fields(Config) if field.name != "preset"]
+    values = ((name, getattr(saved, name), getattr(config, name)) for name in names)
+    changed = [f"{name} was {old} and is {new}" for name, old, new in values if old != new]
+    if changed:
+        raise RunError(f"{directory} holds a run with other settings: {', '.join(changed)}.")
+
+
+def read_versions(directory: Path) -> dict[str, str]:
+    """Of the stack that began the run."""
+    return json.loads((directory / CONFIG).read_text(encoding="utf-8"))["versions"]
+
+
+def read_id(directory: Path) -> str:
+    """Of the run, drawn when it began."""
+    return json.loads((directory / CONFIG).read_text(encoding="utf-8"))["id"]
+
+
+def append_metrics(directory: Path, row: dict[str, Any]) -> None:
+    """One line of metrics.jsonl, on disk when this returns.
+
+    Raises:
+      SaveError: it cannot be written; an unfinished line is left out by all who read.
+    """
+    path = directory / METRICS
+    with writing(path), open(path, "a", encoding="utf-8") as file:
+        file.write(_lines([row]))
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_metrics(directory: Path) -> list[dict[str, Any]]:
+    """The rows of metrics.jsonl; an unfinished last line is left out."""
+    path = directory / METRICS
+    lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
+    try:
+        return [json.loads(line) for line in lines]
+    except ValueError:
+        raise RunError(f"{path} holds a line that is not JSON.") from None
+
+
+def write_metrics(directory: Path, rows: list[dict[str, Any]]) -> None:
+    """metrics.jsonl with these rows and no others; where it has them, it is left as it is."""
+    path, text = directory / METRICS, _lines(rows)
+    if not path.exists() or path.read_text(encoding="utf-8") != text:
+        _replace(path, text)
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """A JSON file, whole or not at all. What is not finite becomes null."""
+    _replace(path, json.dumps(jsonable(content), indent=2) + "\n")
+
+
+def jsonable(value: Any) -> Any:
+    """The value in JSON's types. What is not finite becomes null."""
+    if isinstance(value, dict):
+        return {key: jsonable(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [jsonable(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def check_writable(directory: Path) -> None:
+    """Whether a command can leave its results there.
+
+    Raises:
+      RunError: it cannot.
+    """
+    if not os.access(directory, os.W_OK | os.X_OK):
+        raise RunError(f"{directory} cannot be written to: make it writable, or copy it elsewhere.")
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turns a full disk or a missing permission into one sentence.
+
+    Raises:
+      SaveError: what is done inside met an OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise SaveError(
+            f"cannot write {path}: {error.strerror or error}; what was saved before is intact."
+        ) from error
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A temporary file to write to, which takes the path's place once all went well.
+
+    Raises:
+      SaveError: it cannot be written.
+    """
+    temporary = temporary_of(path)
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            yield temporary
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def temporary_of(path: Path) -> Path:
+    """The file that `whole_file` writes to before it takes the path's place."""
+    return path.with_suffix(f".tmp{path.suffix}")
+
+
+def _lines(rows: list[dict[str, Any]]) -> str:
+    return "".join(json.dumps(jsonable(row)) + "\n" for row in rows)
+
+
+def _replace(path: Path, text: str) -> None:
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

@@ -1,0 +1,150 @@
+"""What a process settles before jax computes anything. Imports jax only when it is called.
+
+Environment variables of jax's that would change our programs are overruled, and those with which
+jax cannot start are refused in a sentence.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from types import ModuleType
+
+from maxent_jax.errors import UsageError
+from maxent_jax.runs import machine
+
+IN_ORDER = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
+# Options that users set for other programs. Ours are written in 32 bits, for jit, and with
+# infinities and NaN where they mean something; their results are those without these variables.
+SETTLED = {
+    "jax_enable_x64": False,
+    "jax_debug_nans": False,
+    "jax_debug_infs": False,
+    "jax_disable_jit": False,
+    "jax_debug_key_reuse": False,
+    "jax_check_tracer_leaks": False,
+    "jax_raise_persistent_cache_errors": False,
+    "jax_numpy_rank_promotion": "allow",
+    "jax_numpy_dtype_promotion": "standard",
+    "jax_transfer_guard": "allow",
+    "jax_transfer_guard_host_to_device": "allow",
+    "jax_transfer_guard_device_to_host": "allow",
+    "jax_transfer_guard_device_to_device": "allow",
+}
+PROBE = "import jax; jax.devices('cpu')"
+PROBE_SECONDS = 60
+
+
+def prepare(simulates_in_jax: bool) -> None:
+    """Loads jax, with the options that our programs expect and its persistent compilation cache.
+
+    Args:
+      simulates_in_jax: physics in jax (MJX, brax) will run; on a CPU its threads then run in order.
+        XLA of jaxlib 0.10 otherwise locks up in MJX's Humanoid (all threads idle, for ever), from
+        64 environments on. It costs other programs 5 to 10 %, and must precede the first
+        computation. A user's own XLA_FLAGS are kept.
+    Raises:
+      UsageError: the environment has a variable, or the shell a limit, with which jax cannot start.
+    """
+    if "jax" not in sys.modules:
+        machine.check_limits()
+        _check_flags()
+    jax = _load()
+    for name, value in SETTLED.items():
+        if name.upper() in os.environ and name in jax.config.values:
+            jax.config.update(name, value)
+    _settle_cache(jax)
+    flags = os.environ.get("XLA_FLAGS", "")
+    if simulates_in_jax and IN_ORDER.split("=")[0] not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {IN_ORDER}".strip()
+
+
+def start(simulates_in_jax: bool) -> None:
+    """`prepare`, and `check_devices`, for a process that computes alone."""
+    prepare(simulates_in_jax)
+    check_devices()
+
+
+def check_devices() -> None:
+    """Starts jax's backend; several processes must have met before.
+
+    Raises:
+      UsageError: there is no device, or none of the kind that the environment asks for.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    try:
+        jax.devices()
+        jnp.zeros(()).block_until_ready()
+    except Exception as error:  # of every kind, by what is missing
+        said = _first_line(error).split(" (set JAX_PLATFORMS")[0]
+        reason = f" ({said})" if str(error) else ""
+        for variable in ("JAX_PLATFORMS", "JAX_DEFAULT_DEVICE"):
+            wanted = os.environ.get(variable)
+            if wanted:
+                raise UsageError(
+                    f"{variable} is '{wanted}', but jax finds no such device here{reason}: "
+                    f"unset it, or set it to cpu."
+                ) from None
+        raise UsageError(f"jax finds no device here{reason}.") from None
+
+
+def _load() -> ModuleType:
+    try:
+        import jax
+    except (ValueError, RuntimeError) as error:  # a variable that it reads when it is loaded
+        raise UsageError(f"jax cannot be loaded: {_first_line(error)}") from None
+    return jax
+
+
+def _check_flags() -> None:
+    """Where the user has set XLA_FLAGS: XLA ends a process for a flag that it does not know."""
+    flags = os.environ.get("XLA_FLAGS", "").replace(IN_ORDER, "").strip()
+    if not flags:
+        return
+    others = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    done = subprocess.run(
+        [sys.executable, "-c", PROBE],
+        env=others | {"JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        errors="replace",
+        timeout=PROBE_SECONDS,
+        check=False,
+    )
+    if done.returncode:
+        lines = [line for line in done.stderr.splitlines() if "XLA_FLAGS" in line or "lag" in line]
+        reason = f" ({lines[0].split('] ')[-1].strip()})" if lines else ""
+        raise UsageError(f"XLA_FLAGS is '{flags}', with which XLA cannot start{reason}.")
+
+
+def _settle_cache(jax: ModuleType) -> None:
+    """In the user's own cache folder, unless jax was told of another; off where it is read-only."""
+    if not jax.config.values["jax_enable_compilation_cache"]:  # as the user or we have settled
+        return
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    try:
+        if not folder:
+            cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+            folder = str(cache / "maxent_jax" / "jax")
+        if "://" not in folder:
+            Path(folder).mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+    except (OSError, RuntimeError, ValueError) as error:  # RuntimeError: there is no home
+        jax.config.update("jax_enable_compilation_cache", False)
+        reason = getattr(error, "strerror", None) or error
+        print(
+            f"note: programs are compiled anew each time, for {folder or 'the cache folder'} "
+            f"cannot be written: {reason}.",
+            file=sys.stderr,
+        )
+        return
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")

@@ -1,0 +1,67 @@
+"""MEPOL at the env steps of a study: it learns by other means, and is no run of `train`.
+
+Its gradient steps are what its trust region allows, far fewer than SAC's, each on a whole batch of
+episodes.
+"""
+
+import contextlib
+import dataclasses
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from maxent_jax import components
+from maxent_jax.baselines import mepol
+from maxent_jax.baselines.mepol import Settings
+from maxent_jax.config import Config
+from maxent_jax.runs import files
+from maxent_jax.studies import values
+from maxent_jax.studies.values import COLUMNS, Row
+
+METHOD, RESULTS = "MEPOL", "mepol.json"
+
+
+def rows(directory: Path, config: Config, num_seeds: int) -> list[Row]:
+    """A row for each seed and iteration; computed once, and read from the directory afterwards."""
+    path = directory / RESULTS
+    asked = files.jsonable(
+        {"config": dataclasses.asdict(config), "seeds": num_seeds}
+        | {"settings": dataclasses.asdict(settings_of(config))}
+    )
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # none yet, or a damaged one
+        held = json.loads(path.read_text(encoding="utf-8"))
+        if {name: held.get(name) for name in asked} == asked:
+            return [values.known(row) for row in held["rows"]]
+    found = _train(config, num_seeds)
+    files.write_json(path, asked | {"versions": files.stack(), "rows": found})
+    return found
+
+
+def settings_of(config: Config) -> Settings:
+    """MEPOL's own, in batches of about its own size that fit into an iteration's env steps."""
+    usual = Settings.num_episodes * config.episode_length
+    num_epochs = max(1, round(config.steps_per_iteration / usual))
+    num_episodes = config.steps_per_iteration // (num_epochs * config.episode_length)
+    return Settings(num_epochs=num_epochs, num_episodes=num_episodes)
+
+
+def _train(config: Config, num_seeds: int) -> list[dict[str, Any]]:
+    p, settings, started = components.make(config), settings_of(config), time.perf_counter()
+    keys = jax.vmap(jax.random.key)(config.seed + jax.numpy.arange(num_seeds))
+    state = jax.jit(jax.vmap(lambda key: mepol.init(p, settings, key)))(keys)
+    iterate = jax.jit(jax.vmap(lambda state: mepol.iterate(p, settings, state)))
+    found = []
+    for iteration in range(1, config.num_iterations + 1):
+        state, metrics = iterate(state)
+        measured = {name: metrics[name].tolist() for name in COLUMNS if name in metrics}
+        seconds = time.perf_counter() - started
+        found += [
+            {"env": config.env, "method": METHOD, "seed": config.seed + i}
+            | {"iteration": iteration, "wall_seconds": seconds}
+            | {name: values[i] for name, values in measured.items()}
+            for i in range(num_seeds)
+        ]
+    return found

@@ -1,0 +1,184 @@
+"""From finished studies to figures, tables and summaries."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from maxent_jax import mixture
+from maxent_jax.algorithm import methods
+from maxent_jax.config import Config
+from maxent_jax.runs import files, locks
+from maxent_jax.studies import (
+    hazan_weights,
+    mepol_values,
+    paper_figures,
+    protocol,
+    statistics,
+    values,
+)
+from maxent_jax.studies.protocol import Cell
+from maxent_jax.visual import plotting
+
+FIG2_TIMES = (5, 10, 20)
+SUMMARISED = (
+    *("cumulative_coverage", "cumulative_entropy"),
+    *("mixture_coverage", "mixture_entropy", "mixture_knn_entropy"),
+)
+
+# What a study's methods may differ in as a number: its name in the figure, and its value.
+ALONG: dict[str, tuple[str, Callable[[Config], float]]] = {
+    "refresh_period": (
+        "env steps between refreshes",
+        lambda config: (
+            methods.row(config).refresh_period * config.num_envs or config.steps_per_iteration
+        ),
+    ),
+    "episodic_weight": ("λ", lambda config: config.episodic_weight),
+}
+
+
+def draw(
+    whats: Iterable[str],
+    scale: str,
+    num_seeds: int | None,
+    out: Path,
+    studies: Mapping[str, Sequence[Cell]],
+) -> None:
+    """Figures and studies by name, into directories of theirs; prints each file and table."""
+    for what in whats:
+        with locks.holding(out / what):  # of processes that share it, one at a time
+            if what == "fig2":
+                fig2(out / "fig2")
+            elif what == "fig3":
+                fig3(out / "fig3", scale, num_seeds)
+            elif what == "fig5":
+                fig5(out / "fig5", out / "fig4", studies["fig4"])
+            else:
+                study(out / what, what, studies[what])
+
+
+def fig2(directory: Path) -> None:
+    """The mixture's weights, exactly."""
+    weights = {
+        f"t = {time}": {"uniform": mixture.uniform_weights(time)}
+        | {f"η = {eta}": mixture.geometric_weights(time, eta) for eta in protocol.ETAS}
+        for time in FIG2_TIMES
+    }
+    files.write_json(directory / "weights.json", weights)
+    _save(paper_figures.weights(weights), directory, "fig2")
+    print(f"{directory / 'weights.json'}")
+
+
+def fig3(directory: Path, scale: str, num_seeds: int | None) -> None:
+    """Weights in the classic environments with the official settings; Ant's are a study."""
+    found = hazan_weights.results(directory, scale, num_seeds)
+    table = hazan_weights.table(found)
+    files.write_json(directory / "summary.json", dict(table))
+    _save(paper_figures.classic_weights(hazan_weights.curves(found)), directory, "fig3")
+    _print("uniform", table)
+    print(f"{directory / hazan_weights.RESULTS}, {directory / 'summary.json'}")
+
+
+def study(directory: Path, name: str, cells: Sequence[Cell]) -> None:
+    """raw.csv, summary.json and the curves of a study, and its table."""
+    rows = values.read(directory, cells)
+    if protocol.STUDIES[name].mepol:
+        ours = [cell for cell in cells if cell.method == cells[0].method]
+        for config in (cell.config for cell in ours):
+            rows += mepol_values.rows(directory / config.env, config, config.num_seeds)
+    values.write(directory / "raw.csv", rows)
+    groups = list(values.groups(rows))
+    summary: dict[str, Any] = {
+        "study": name,
+        "what": _what(name),
+        "versions": _versions(directory, cells),
+        **summarise(groups),
+    }
+    files.write_json(directory / "summary.json", summary)
+    _save(paper_figures.curves(groups, _what(name)), directory, name)
+    if field := protocol.STUDIES[name].along:
+        label, value = ALONG[field]
+        places = {(cell.config.env, cell.method): value(cell.config) for cell in cells}
+        _save(paper_figures.along(groups, places, label, _what(name)), directory, f"{name}_along")
+    for env, table in summary["last_iteration"].items():
+        _print(summary["compared_with"], {f"{env}, {measure}": table[measure] for measure in table})
+    if len(summary["versions"]) > 1:
+        print(f"note: the runs were made with {len(summary['versions'])} sets of versions.")
+    print(f"{directory / 'raw.csv'}, {directory / 'summary.json'}")
+
+
+def fig5(directory: Path, trained: Path, cells: Sequence[Cell]) -> None:
+    """Where the first seed of each method went: in training, by the mixture, and each policy."""
+    for env in dict.fromkeys(cell.config.env for cell in cells):
+        chosen = [c for c in cells if c.config.env == env and c.config.seed == 0]
+        figure = paper_figures.occupancies({c.method: protocol.home(trained, c) for c in chosen})
+        _save(figure, directory, f"fig5_{env}")
+
+
+def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[str, Any]:
+    """The last iteration of each environment: interquartile means, intervals, and how likely V, or
+    the first method, is to be better than each other; and that in all environments together.
+    """
+    envs = sorted({env for env, _, _ in groups})
+    names = list(dict.fromkeys(method for _, method, _ in groups))
+    ours = "V" if "V" in names else names[0]
+    last = {
+        env: {
+            name: {
+                method: columns[name][:, -1]
+                for at, method, columns in groups
+                if at == env and name in columns
+            }
+            for name in SUMMARISED
+        }
+        for env in envs
+    }
+    everywhere = {  # where that says more than the one environment does
+        name: statistics.improvements(
+            {
+                method: [last[env][name][method] for env in envs]
+                for method in names
+                if all(method in last[env][name] for env in envs)
+            },
+            ours,
+        )
+        for name in (SUMMARISED if len(envs) > 1 else ())
+    }
+    return {
+        "compared_with": ours,
+        "seeds": len(groups[0][2]["env_steps"]),
+        "last_iteration": {
+            env: {name: statistics.compare(by_method, ours) for name, by_method in of_env.items()}
+            for env, of_env in last.items()
+        },
+        "all_environments": everywhere,
+    }
+
+
+def _versions(directory: Path, cells: Sequence[Cell]) -> list[dict[str, str]]:
+    """The stacks that made the runs, each once."""
+    of_cells = [files.read_versions(protocol.home(directory, cell)) for cell in cells]
+    return [v for i, v in enumerate(of_cells) if v not in of_cells[:i]]
+
+
+def _what(name: str) -> str:
+    return protocol.STUDIES[name].what
+
+
+def _print(ours: str, table: Mapping[str, Mapping[str, Any]]) -> None:
+    for name, by_method in table.items():
+        print(f"{name}, interquartile mean [95 %], P({ours} is better)")
+        for method, found in by_method.items():
+            low, high = found["interval"]
+            text = f"  {method:18} {found['interquartile_mean']:9.2f} [{low:.2f}, {high:.2f}]"
+            if "probability_of_improvement" in found:
+                low, high = found["probability_interval"]
+                text += f"  {found['probability_of_improvement']:.2f} [{low:.2f}, {high:.2f}]"
+            print(text)
+
+
+def _save(figure: Figure, directory: Path, name: str) -> None:
+    print(plotting.save(figure, directory, name))

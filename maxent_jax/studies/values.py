@@ -1,0 +1,83 @@
+"""The raw values of a study's runs: a row for each seed and iteration, and CSV files of them."""
+
+import csv
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from maxent_jax.runs import files
+from maxent_jax.studies import protocol
+from maxent_jax.studies.protocol import Cell
+
+MEASURED = ("coverage", "entropy", "off_grid_share")
+COLUMNS = (
+    *("env", "method", "seed", "iteration", "env_steps", "gradient_steps", "wall_seconds"),
+    *(f"cumulative_{name}" for name in MEASURED),
+    *(f"mixture_{name}" for name in (*MEASURED, "knn_entropy")),
+    *("effective_policies", "evaluation_episode_length", "num_rollout_steps"),
+)
+RANDOM = "random policy"
+
+Row = dict[str, Any]
+
+
+def read(directory: Path, cells: Sequence[Cell]) -> list[Row]:
+    """Of all cells, and of the random policy beside the first method's runs."""
+    found = []
+    first = cells[0].method
+    for cell in cells:
+        for row in files.read_metrics(protocol.home(directory, cell)):
+            for index in range(cell.config.num_seeds):
+                seed = cell.config.seed + index
+                head: Row = {"env": cell.config.env, "method": cell.method, "seed": seed}
+                own = {k: v[index] if isinstance(v, list) else v for k, v in row.items()}
+                found.append(head | known(own))
+                if cell.method == first and "random_coverage" in own:
+                    found.append(head | _of_random(own))
+    return sorted(found, key=lambda row: (row["env"], row["method"] == RANDOM))
+
+
+def known(row: Row) -> Row:
+    """What the columns ask for, of a row that was kept as JSON.
+
+    That knows no infinity, and of the measures a single one can leave the finite numbers, to one
+    side: where states coincide, their entropy in features is -inf.
+    """
+    own = {name: row[name] for name in COLUMNS if name in row}
+    return {name: -math.inf if value is None else value for name, value in own.items()}
+
+
+def write(path: Path, rows: Sequence[Row]) -> None:
+    """As CSV, whole or not at all."""
+    with (
+        files.whole_file(path) as temporary,
+        open(temporary, "w", encoding="utf-8", newline="") as file,
+    ):
+        writer = csv.DictWriter(file, COLUMNS, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def groups(rows: Sequence[Row]) -> Iterator[tuple[str, str, dict[str, np.ndarray]]]:
+    """Environment, method, and columns [seeds, iterations] of what every row of theirs has."""
+    names = dict.fromkeys((row["env"], row["method"]) for row in rows)
+    for env, method in names:
+        own = [row for row in rows if (row["env"], row["method"]) == (env, method)]
+        seeds = sorted({row["seed"] for row in own})
+        ordered = [[row for row in own if row["seed"] == seed] for seed in seeds]
+        columns = [name for name in COLUMNS[3:] if all(name in row for row in own)]
+        yield (
+            env,
+            method,
+            {c: np.array([[row[c] for row in of_seed] for of_seed in ordered]) for c in columns},
+        )
+
+
+def _of_random(row: Row) -> Row:
+    """What the random policy beside a run reached."""
+    kept = {name: row[name] for name in ("iteration", "env_steps", "wall_seconds")}
+    reached = {f"cumulative_{name}": row[f"random_{name}"] for name in MEASURED}
+    return {"method": RANDOM, "gradient_steps": 0} | kept | reached

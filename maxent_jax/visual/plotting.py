@@ -1,0 +1,218 @@
+"""The figures of a run: curves, the log-occupancy map (Fig. 5), and the paths of each policy."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
+
+from maxent_jax.analysis import Paths, Run
+from maxent_jax.density import histogram
+from maxent_jax.density.histogram import Grid
+from maxent_jax.runs.files import FIGURES, whole_file
+
+COVERAGE_AXES = (
+    ("iteration", "iteration"),
+    ("env_steps", "thousand env steps"),
+    ("wall_seconds", "wall-clock (s)"),
+)
+COMPARED = (
+    ("cumulative", "training", "-"),
+    ("mixture", "mixture", "--"),
+    ("random", "random policy", ":"),
+)
+NAMES = ("curves", "occupancy", "fireworks")
+AGENT, MIXTURE, RANDOM = "#1b6ca8", "#d1495b", "#7a7a7a"
+
+
+def curves(run: Run) -> Figure:
+    """Coverage and entropy against iterations, env steps and wall-clock."""
+    figure = Figure(figsize=(11, 6.4), layout="constrained")
+    axes = _axes_of_curves(figure, f"visited cells of {run.components.grid.num_cells:,}")
+    for prefix, name, color, style in (
+        ("cumulative", "training, all states so far", AGENT, "-o"),
+        ("mixture", "rollouts of the mixture", MIXTURE, "-s"),
+        ("random", "random policy, as many steps", RANDOM, "--"),
+    ):
+        _draw_curves(axes, run, prefix, style, color=color, label=name, ms=4)
+    _start_at_zero(axes)
+    axes[1, 0].legend(frameon=False, fontsize=9, loc="lower right")
+    return _finish(figure, run)
+
+
+def comparison(seeds: Mapping[str, Sequence[Run]]) -> Figure:
+    """The curves of several runs, one colour each, and of all their seeds.
+
+    Args:
+      seeds: the seeds of each run, by a name for the legend.
+    """
+    figure = Figure(figsize=(11, 6.8), layout="constrained")
+    axes = _axes_of_curves(figure, "visited cells")
+    styles = [Line2D([], [], color="black", ls=style, label=label) for _, label, style in COMPARED]
+    colors = []
+    for i, (name, runs) in enumerate(seeds.items()):
+        color = f"C{i % 10}"
+        for run, (prefix, _, style) in itertools.product(runs, COMPARED):
+            _draw_curves(axes, run, prefix, color=color, ls=style, marker=".", lw=1.2, ms=4)
+        colors.append(Line2D([], [], color=color, lw=4, label=name))
+    _start_at_zero(axes)
+    axes[1, 0].legend(handles=styles, frameon=False, fontsize=9, loc="lower right")
+    legend = figure.legend(handles=colors, frameon=False, fontsize=9, loc="outside lower center")
+    for text in legend.get_texts():
+        text.set_parse_math(False)  # a name may hold any sign
+    return figure
+
+
+def _axes_of_curves(figure: Figure, coverage_label: str) -> np.ndarray:
+    """[2, 3]: coverage and entropy, against each of the three axes."""
+    axes = figure.subplots(2, 3, sharey="row")
+    for column, (_, label) in enumerate(COVERAGE_AXES):
+        for ax in axes[:, column]:
+            ax.set_xlabel(label)
+            ax.grid(alpha=0.25)
+    for ax, label in zip(axes[:, 0], (coverage_label, "histogram entropy (nats)"), strict=True):
+        ax.set_ylabel(label)
+    return axes
+
+
+def _start_at_zero(axes: np.ndarray) -> None:
+    """Once all is drawn: it ends the automatic choice of the upper limit."""
+    for ax in axes[:, 0]:
+        ax.set_ylim(bottom=0)
+
+
+def _draw_curves(axes: np.ndarray, run: Run, prefix: str, *style: str, **options: Any) -> None:
+    """One line in each of the axes; none for what the run did not measure."""
+    for quantity, row in zip(("coverage", "entropy"), axes, strict=True):
+        values = run.metrics.get(f"{prefix}_{quantity}")
+        if values is None:
+            continue
+        for (axis, _), ax in zip(COVERAGE_AXES, row, strict=True):
+            x = run.metrics[axis] / (1000 if axis == "env_steps" else 1)
+            ax.plot(x, values, *style, **options)
+
+
+def occupancy_map(run: Run, mixture_cells: np.ndarray) -> Figure:
+    """log10 of the visits to each cell: in training, and by the mixture (after the paper's Fig. 5).
+
+    Args:
+      mixture_cells: [bins, bins] share of the mixture's occupancy.
+    """
+    figure = Figure(figsize=(11, 5.2), layout="constrained")
+    panels = (
+        ("states met in training", run.histogram / max(run.histogram.sum(), 1)),
+        ("rollouts of the mixture", mixture_cells),
+    )
+    visited = np.concatenate([np.log10(cells[cells > 0]) for _, cells in panels])
+    limits = (visited.min(), visited.max()) if visited.size else (None, None)
+    for ax, (title, cells) in zip(figure.subplots(1, 2), panels, strict=True):
+        image = draw_occupancy(ax, run, cells, limits)
+        ax.set_title(title)
+    figure.colorbar(image, ax=figure.axes, label="log10 share of the states", shrink=0.85)
+    return _finish(figure, run)
+
+
+def fireworks(run: Run, paths: Paths) -> Figure:
+    """Where the episodes of each policy go, one colour for each policy."""
+    figure = Figure(figsize=(7.4, 6.6), layout="constrained")
+    ax = figure.subplots()
+    draw_paths(ax, run, paths)
+    for policy, color in enumerate(policy_colors(run.num_policies)):
+        ax.plot([], [], color=color, label=f"π{policy}" + (" (untrained)" if policy == 0 else ""))
+    ax.set_title("paths of the archived policies; dots where they end")
+    ax.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
+    return _finish(figure, run)
+
+
+def draw_occupancy(
+    ax: Axes,
+    run: Run,
+    shares: np.ndarray,
+    limits: tuple[float | None, float | None] = (None, None),
+) -> AxesImage:
+    """log10 of the share of states in each cell, [bins, bins], within limits of the colours."""
+    low, high = limits
+    image = ax.imshow(
+        np.log10(np.where(shares > 0, shares, np.nan)).T,
+        origin="lower",
+        extent=_extent(run),
+        aspect="auto",
+        vmin=low,
+        vmax=high,
+    )
+    _name_axes(ax, run)
+    return image
+
+
+def draw_paths(ax: Axes, run: Run, paths: Paths) -> None:
+    """Where the episodes of each policy go, and the grid's edge."""
+    colors = policy_colors(run.num_policies)
+    for states, alive, policy in zip(*paths, strict=True):
+        xy = np.asarray(histogram.locate(states[alive], run.components.grid))
+        ax.plot(*xy.T, color=colors[policy], lw=0.9, alpha=0.8)
+        ax.plot(*xy[-1:].T, "o", color=colors[policy], ms=3)
+    _name_axes(ax, run)
+    low_x, high_x, low_y, high_y = _extent(run)
+    ax.plot(
+        [low_x, high_x, high_x, low_x, low_x],
+        [low_y, low_y, high_y, high_y, low_y],
+        ":",
+        color=RANDOM,
+        lw=0.8,
+    )
+    if run.components.torso is not None:  # a map, seen from above
+        ax.set_aspect("equal")
+    ax.grid(alpha=0.25)
+
+
+def policy_colors(num_policies: int) -> np.ndarray:
+    """[P, 4] RGBA in [0, 1]: black for the untrained policy, then from blue to red."""
+    trained = matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, max(num_policies - 1, 1)))
+    return np.concatenate([[[0, 0, 0, 1]], trained])[:num_policies]
+
+
+def save_all(run: Run, mixture_cells: np.ndarray, paths: Paths) -> None:
+    """The three figures, into the run's directory."""
+    drawn = curves(run), occupancy_map(run, mixture_cells), fireworks(run, paths)
+    for name, figure in zip(NAMES, drawn, strict=True):
+        save(figure, run.path / FIGURES, name)
+
+
+def all_saved(run_directory: Path) -> bool:
+    """Whether the run's directory holds the three figures."""
+    return all((run_directory / FIGURES / f"{name}.png").exists() for name in NAMES)
+
+
+def save(figure: Figure, directory: Path, name: str) -> Path:
+    """Writes a figure as PNG, whole or not at all."""
+    path = directory / f"{name}.png"
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=110, bbox_inches="tight")
+    return path
+
+
+def _extent(run: Run) -> tuple[float, float, float, float]:
+    grid: Grid = run.components.grid
+    return grid.low[0], grid.high[0], grid.low[1], grid.high[1]
+
+
+def _name_axes(ax: Axes, run: Run) -> None:
+    x_name, y_name = run.components.grid.names
+    ax.set(xlabel=x_name, ylabel=y_name)
+
+
+def _finish(figure: Figure, run: Run) -> Figure:
+    """Title and, below, every deviation from the paper by name."""
+    config = run.config
+    figure.suptitle(
+        f"MaxEnt-{config.method.upper()}, {config.env}, preset {config.preset}, seed {run.seed}"
+    )
+    named = ", ".join(f"{name}={getattr(config, name)}" for name in config.deviations())
+    figure.supxlabel(f"departs from the paper in: {named or 'nothing'}", fontsize=6, wrap=True)
+    return figure
