@@ -16,8 +16,8 @@ from typing import Any
 
 from benchmarks import common
 from maxent_jax.config import preset
-from maxent_jax.config.names import ENVS
 from maxent_jax.config.presets import PRESETS
+from maxent_jax.config.registry import ENVS
 from maxent_jax.runs import files
 
 TRAIN = ("-m", "experiments.train", "--num-iterations", "1")
@@ -26,7 +26,7 @@ TRAIN = ("-m", "experiments.train", "--num-iterations", "1")
 def first_step(env: str, name: str, directory: Path, cache: Path) -> float:
     """Seconds until the first step of a run, which ends soon after it."""
     config = preset(name, env=env)
-    steps = config.num_envs * config.num_segments
+    steps = config.budget.num_envs * config.budget.num_segments
     flags = ("--env", env, "--preset", name, "--steps-per-iteration", str(steps))
     subprocess.run(
         [sys.executable, *TRAIN, *flags, "--out", str(directory)],

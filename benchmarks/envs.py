@@ -22,7 +22,7 @@ from mujoco import rollout
 from benchmarks import common
 from maxent_jax import envs
 from maxent_jax.config import Config
-from maxent_jax.config.names import PHYSICS
+from maxent_jax.config.registry import PHYSICS
 from maxent_jax.envs import base, physics
 from maxent_jax.envs.task import MujocoEnv
 from maxent_jax.runs import runtime
@@ -100,14 +100,16 @@ def with_episodes(workload: Workload, repeats: int) -> Measurement:
 
     def run(episodes, actions, keys):
         def step(episodes, inputs):
-            return base.step(workload.env, episodes, inputs[0], Config.episode_length, inputs[1])
+            return base.step(
+                workload.env, episodes, inputs[0], Config.environment.episode_length, inputs[1]
+            )
 
         _, transitions = jax.lax.scan(step, episodes, (actions, keys))
         return transitions.next_observation
 
     key = jax.random.key(SEED)
     init = jax.jit(base.init, static_argnums=(0, 1, 2))
-    episodes = init(workload.env, actions.shape[1], Config.num_starts, key)
+    episodes = init(workload.env, actions.shape[1], Config.environment.num_starts, key)
     program, _ = common.compiled(run, episodes, actions, keys)
     seconds = common.median_seconds(lambda: program(episodes, actions, keys), repeats)
     return Measurement(workload.num_steps / seconds, None, {})

@@ -23,10 +23,12 @@ from maxent_jax.sac import agent, losses, replay
 def init(config: Config, key: jax.Array):
     p = components.make(config)
     key_agent, key_episodes = jax.random.split(key)
-    episodes = base.init(p.env, config.num_envs, config.num_starts, key_episodes)
+    episodes = base.init(p.env, config.budget.num_envs, config.environment.num_starts, key_episodes)
     scalar, state = jnp.zeros(()), jnp.zeros(p.sac.observation_size)
     action = jnp.zeros(p.sac.action_size)
-    ring = replay.init(losses.Batch(state, action, scalar, state, scalar), config.replay_size)
+    ring = replay.init(
+        losses.Batch(state, action, scalar, state, scalar), config.learner.replay_size
+    )
     return agent.init(p.sac, key_agent), episodes, ring
 
 
@@ -36,13 +38,13 @@ def step(config: Config, carry, key: jax.Array):
     learner, episodes, ring = carry
     key_act, key_env, key_sample, key_update = jax.random.split(key, 4)
     action = agent.act(p.sac, learner.parameters.policy, episodes.env.obs, key_act)
-    episodes, t = base.step(p.env, episodes, action, config.episode_length, key_env)
+    episodes, t = base.step(p.env, episodes, action, config.environment.episode_length, key_env)
     velocity = (t.next_observation[:, 0] - t.observation[:, 0]) / p.env.dt
     alive = 1.0 - t.terminated.astype(jnp.float32)
     ring = replay.add(
         ring, losses.Batch(t.observation, t.action, velocity, t.next_observation, alive), t.valid
     )
-    shape = (config.updates_per_vector_step, config.batch_size)
+    shape = (config.updates_per_vector_step, config.learner.batch_size)
     batches = replay.sample(ring, shape, key_sample)
     learner, _ = jax.lax.scan(
         lambda a, x: agent.update(p.sac, a, *x),
@@ -82,7 +84,7 @@ def main() -> None:
     row = {
         "benchmark": "forward_velocity",
         "seed": args.seed,
-        "env_steps": done * config.num_envs,
+        "env_steps": done * config.budget.num_envs,
         "gradient_steps": done * config.updates_per_vector_step,
         "mean_velocity_last_segment": round(velocity, 3),
         "wall_seconds": round(time.perf_counter() - started, 1),

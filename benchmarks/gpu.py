@@ -229,7 +229,9 @@ def env_steps(names: tuple[str, ...], sizes: tuple[int, ...], session: Session) 
                 key_act, key_env = jax.random.split(key)
                 shape = (num_envs, env.action_size)
                 action = jax.random.uniform(key_act, shape, minval=-1, maxval=1)
-                episodes, seen = base.step(env, episodes, action, Config.episode_length, key_env)
+                episodes, seen = base.step(
+                    env, episodes, action, Config.environment.episode_length, key_env
+                )
                 return (episodes, ends + seen.terminated.sum()), None
 
             keys = jax.random.split(key, RATE_STEPS)
@@ -399,7 +401,7 @@ def kernels(session: Session) -> Measure:
     if session.toy:
         config = preset("smoke", env="pendulum", **settings)
     else:
-        steps = preset("gpu").num_envs * TRACE_STEPS
+        steps = preset("gpu").budget.num_envs * TRACE_STEPS
         config = preset("gpu", env="ant", steps_per_iteration=steps, **settings)
     state = algorithm.start(config)
     points = jax.random.normal(jax.random.key(0), state.learner.reference.points.shape)

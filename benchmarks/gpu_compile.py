@@ -121,7 +121,9 @@ def steps(name: str, num_envs: int, num_steps: int) -> tuple[Callable, tuple]:
 
     def run(episodes, actions, keys):
         def step(episodes, inputs):
-            return base.step(env, episodes, inputs[0], Config.episode_length, inputs[1])[0], None
+            return base.step(
+                env, episodes, inputs[0], Config.environment.episode_length, inputs[1]
+            )[0], None
 
         return jax.lax.scan(step, episodes, (actions, keys))[0]
 
@@ -157,9 +159,9 @@ def main() -> None:
         "5 steps of 4,096 ants": (5, lambda: steps("ant", 4096, 5)),
         "5 steps of 4,096 walkers": (5, lambda: steps("walker2d", 4096, 5)),
         "5 steps of 4,096 humanoids": (5, lambda: steps("humanoid", 4096, 5)),
-        "ant, begin": (config.episode_length, lambda: part(algorithm.begin)),
+        "ant, begin": (config.environment.episode_length, lambda: part(algorithm.begin)),
         "ant, train_segment": (config.vector_steps, lambda: part(algorithm.train_segment)),
-        "ant, end": (config.episode_length, lambda: part(algorithm.end)),
+        "ant, end": (config.environment.episode_length, lambda: part(algorithm.end)),
     }
     if args.toy:
         programs = {"kNN 8 x 64": (1, lambda: search(8, 64))}

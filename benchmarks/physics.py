@@ -209,7 +209,7 @@ def learn(name: str, label: str, seed: int) -> dict[str, Any]:
     started = time.perf_counter()
     programs = algorithm.programs(config)
     state, _ = programs.begin(algorithm.start(config))
-    for _ in range(config.num_segments):
+    for _ in range(config.budget.num_segments):
         state, _ = programs.train_segment(state)
     _, metrics = programs.end(state)
     return {

@@ -15,7 +15,7 @@ from maxent_jax import components
 from maxent_jax.algorithm import experience
 from maxent_jax.algorithm.experience import Reference
 from maxent_jax.config import Config, preset
-from maxent_jax.config.names import MUJOCO_ENVS
+from maxent_jax.config.registry import MUJOCO_ENVS
 from maxent_jax.sac import replay
 from maxent_jax.sac.replay import Replay
 from maxent_jax.types import Transition
@@ -32,7 +32,7 @@ def num_bytes(tree: Any) -> int:
 def both_observations(config: Config) -> int:
     """Bytes of a float32 buffer of observation, action, reward, next observation and done flag."""
     sac = components.make(config).sac
-    return 4 * config.replay_size * (2 * sac.observation_size + sac.action_size + 2)
+    return 4 * config.learner.replay_size * (2 * sac.observation_size + sac.action_size + 2)
 
 
 def ring_of(config: Config, full: bool) -> Replay:
@@ -40,27 +40,27 @@ def ring_of(config: Config, full: bool) -> Replay:
     ring = experience.init(components.make(config))
     if not full:
         return ring
-    rows = jnp.arange(config.replay_size, dtype=jnp.int32)
+    rows = jnp.arange(config.learner.replay_size, dtype=jnp.int32)
     pointers = {
-        "previous": (rows - config.num_envs) % config.replay_size,
-        "following": (rows + config.num_envs) % config.replay_size,
+        "previous": (rows - config.budget.num_envs) % config.learner.replay_size,
+        "following": (rows + config.budget.num_envs) % config.learner.replay_size,
     }
-    size = jnp.asarray(config.replay_size, jnp.int32)
+    size = jnp.asarray(config.learner.replay_size, jnp.int32)
     return ring._replace(items=ring.items._replace(**pointers), size=size)
 
 
 def insert_seconds(config: Config, full: bool, repeats: int) -> float:
     """Of one step of all envs, in a donated scan; the search of its distances included."""
     p = components.make(config)
-    n, sac = config.num_envs, p.sac
+    n, sac = config.budget.num_envs, p.sac
     state = jnp.ones((n, sac.observation_size))
     flags = jnp.zeros((3, n), bool)
     transition = Transition(
         state, jnp.zeros((n, sac.action_size)), state, flags[0], flags[1], ~flags[2]
     )
     reference = Reference(
-        jax.random.normal(jax.random.key(0), (config.reference_size, len(p.phi.names))),
-        jnp.asarray(config.reference_size),
+        jax.random.normal(jax.random.key(0), (config.mixture.reference_size, len(p.phi.names))),
+        jnp.asarray(config.mixture.reference_size),
     )
 
     def step(carry, key):
@@ -72,7 +72,11 @@ def insert_seconds(config: Config, full: bool, repeats: int) -> float:
     def inserts(carry):
         return jax.lax.scan(step, carry, jax.random.split(jax.random.key(1), NUM_INSERTS))[0]
 
-    place = (jnp.arange(n, dtype=jnp.int32) - n) % config.replay_size if full else jnp.full(n, -1)
+    place = (
+        (jnp.arange(n, dtype=jnp.int32) - n) % config.learner.replay_size
+        if full
+        else jnp.full(n, -1)
+    )
     carry = [ring_of(config, full), place]
 
     def call():
@@ -85,9 +89,9 @@ def insert_seconds(config: Config, full: bool, repeats: int) -> float:
 def sample_seconds(config: Config, repeats: int) -> float:
     """Of drawing one batch from a full replay."""
     p = components.make(config)
-    starts = jnp.ones((config.num_starts, p.sac.observation_size))
+    starts = jnp.ones((config.environment.num_starts, p.sac.observation_size))
     ring = ring_of(config, full=True)
-    sample = jax.jit(functools.partial(experience.sample, p, shape=(config.batch_size,)))
+    sample = jax.jit(functools.partial(experience.sample, p, shape=(config.learner.batch_size,)))
     return common.median_seconds(lambda: sample(ring, starts, key=jax.random.key(0)), repeats)
 
 

@@ -118,8 +118,8 @@ class Loop(NamedTuple):
 _QUICK = preset("quick")
 LOOPS = (
     Loop(1, 1.0),
-    Loop(_QUICK.num_envs, 1.0),
-    Loop(_QUICK.num_envs, _QUICK.updates_per_step),
+    Loop(_QUICK.budget.num_envs, 1.0),
+    Loop(_QUICK.budget.num_envs, _QUICK.budget.updates_per_step),
 )
 
 

@@ -10,8 +10,8 @@ from typing import Any
 from benchmarks import common
 from maxent_jax import algorithm
 from maxent_jax.config import preset
-from maxent_jax.config.names import BACKENDS, ENVS
 from maxent_jax.config.presets import PRESETS
+from maxent_jax.config.registry import BACKENDS, ENVS
 from maxent_jax.runs import runtime
 
 
@@ -33,7 +33,7 @@ def measure(name: str, settings: dict[str, Any], counts, repeats: int) -> Iterat
     first = 0.0
     for count in counts:
         config = preset(name, num_seeds=count, **settings)
-        steps = count * config.num_envs * config.vector_steps
+        steps = count * config.budget.num_envs * config.vector_steps
         rate = steps / seconds_per_segment(config, repeats)
         first = first or rate
         yield {
@@ -41,9 +41,9 @@ def measure(name: str, settings: dict[str, Any], counts, repeats: int) -> Iterat
             "env": config.env,
             "preset": name,
             "seeds": count,
-            "envs_of_each": config.num_envs,
-            "batch_size": config.batch_size,
-            "updates_per_step": config.updates_per_step,
+            "envs_of_each": config.budget.num_envs,
+            "batch_size": config.learner.batch_size,
+            "updates_per_step": config.budget.updates_per_step,
             "env_steps_per_second": rate,
             "over_one_by_one": rate / first,
         }

@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from maxent_jax import envs, intrinsic
-from maxent_jax.config import Config
-from maxent_jax.config.names import CLASSIC_ENVS, MUJOCO_ENVS
+from maxent_jax.config import Config, registry
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs.base import Env
 from maxent_jax.envs.task import observation_size
@@ -42,26 +41,25 @@ def _make(config: Config) -> Components:
     with jax.ensure_compile_time_eval():  # may be called first while something is being traced
         entry = envs.entry(config.env)
         deviations: dict[str, Any] = {}
-        if config.env in MUJOCO_ENVS:
-            names = ("torque_limit", "end_flipped", "end_unhealthy")
-            deviations = {name: getattr(config, name) for name in names}
-        env = entry.make(config.backend, config.physics, **deviations)
+        if registry.environment(config.env).is_robot:
+            deviations = {name: config[name] for name in envs.DEVIATIONS}
+        env = entry.make(config.environment.backend, config.environment.physics, **deviations)
         num_dims = num_seen = observation_size(env)
         inputs = lambda observation: observation
-        if config.policy_inputs == "heading":
+        if config.learner.policy_inputs == "heading":
             assert entry.torso is not None  # checked by Config
             inputs, num_seen = entry.torso.heading_inputs, entry.torso.num_seen
         sac = agent.make(config, num_dims, env.action_size, inputs)
         phi = make_feature_map(config.env)
         bonus = None
-        if config.bonus != "none":
+        if config.intrinsic.bonus != "none":
             units = _units(config, entry.grid, len(phi.names))
             bonus = intrinsic.make(
-                config.bonus,
+                config.intrinsic.bonus,
                 len(phi.names),
                 env.action_size,
                 units,
-                config.learning_rate,
+                config.learner.learning_rate,
                 entry.grid.num_cells,
             )
         return Components(config, env, entry.grid, entry.torso, num_seen, sac, phi, bonus)
@@ -70,6 +68,6 @@ def _make(config: Config) -> Components:
 def _units(config: Config, grid: Grid, num_features: int) -> jax.Array:
     """[F] what counts as 1 to a bonus: an eighth of the grid's side where features are metres."""
     sides = [1.0, 1.0]
-    if config.env not in CLASSIC_ENVS:
+    if registry.environment(config.env).in_metres:
         sides = [(high - low) / 8 for low, high in zip(grid.low, grid.high, strict=True)]
     return jnp.asarray((sides + [1.0] * num_features)[:num_features])

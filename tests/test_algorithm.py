@@ -1,6 +1,5 @@
 """The outer loop: one program for all methods and seeds, rewards that are never stale."""
 
-import dataclasses
 import functools
 
 import jax
@@ -85,7 +84,7 @@ def test_two_seeds_by_vmap_equal_two_single_runs():
         )
     )(algorithm.start(config))
     for index in range(2):
-        single = dataclasses.replace(config, seed=index, num_seeds=1)
+        single = config.replace(seed=index, num_seeds=1)
         alone, metrics_alone = run(config.program(), algorithm.start(single), 1)
         for name in ("env_steps", "gradient_steps", "iteration", "num_deaths", "best_policy"):
             np.testing.assert_array_equal(metrics[name][index], metrics_alone[name])

@@ -1,6 +1,5 @@
 """Methods as published and baselines within training: what SAC is paid, and what it is not."""
 
-import dataclasses
 import functools
 
 import jax
@@ -9,9 +8,9 @@ import numpy as np
 import pytest
 
 from maxent_jax import algorithm, components
-from maxent_jax.algorithm import experience, methods, training
+from maxent_jax.algorithm import experience, training
 from maxent_jax.config import preset
-from maxent_jax.config.names import BASELINES
+from maxent_jax.config.registry import BASELINES, STARTS
 from maxent_jax.density import histogram
 from maxent_jax.intrinsic import Bonus
 
@@ -64,7 +63,7 @@ QUICK = ("rnd", "apt")  # one that learns a model, one that measures distances
 )
 def test_a_bonus_pays_and_learns_within_training(method):
     config, before, after, metrics = trained(method)
-    assert config.bonus == ("histogram" if method == "h-official" else method)
+    assert config.intrinsic.bonus == ("histogram" if method == "h-official" else method)
     assert jax.tree.structure(before) == jax.tree.structure(after)
     paid = metrics["replay_paid"]
     assert np.isfinite(paid).all() and paid.std() > 0
@@ -92,7 +91,7 @@ def test_ngu_remembers_each_episode_in_its_own_embedding():
 def test_a_baseline_goes_on_from_where_it_was_and_is_its_last_policy():
     config = config_of("rnd")
     method = algorithm.start(config).method
-    assert methods.STARTS[int(method.start)] == "last"
+    assert STARTS[int(method.start)] == "last"
     np.testing.assert_array_equal(method.weights, np.eye(config.archive_size))
 
 
@@ -210,6 +209,6 @@ def test_methods_as_published_are_methods_of_every_preset():
     for name in ("smoke", "quick", "paper", "gpu"):
         for method in (*BASELINES, "h-official"):
             config = preset(name, method=method)
-            assert config.shaping == 0 and config.return_steps == 1
+            assert config.intrinsic.shaping == 0 and config.learner.return_steps == 1
             assert "bonus" in config.deviations()
-            assert dataclasses.replace(config, seed=3).program() == config.program()
+            assert config.replace(seed=3).program() == config.program()

@@ -11,6 +11,7 @@ import pytest
 
 import maxent_jax
 from maxent_jax import algorithm, envs, errors
+from maxent_jax.commands import train
 from maxent_jax.config import preset
 from maxent_jax.envs.pendulum import Pendulum
 from maxent_jax.runs import checkpoint, driver, files, integrity
@@ -115,19 +116,26 @@ def test_a_checkpoint_of_another_config_does_not_fit(tmp_path):
         checkpoint.restore_results(tmp_path, "0", preset("smoke", env="pendulum", hidden_size=16))
 
 
-def test_the_checkpoint_of_this_release_loads(tmp_path):
-    """The first release with this schema made it; see golden/README.md."""
+@pytest.mark.parametrize("schema", files.READABLE)
+def test_a_run_of_each_schema_loads(tmp_path, schema):
+    """The first release with the schema made it; see golden/README.md."""
     directory = tmp_path / "golden"
-    shutil.copytree(GOLDEN, directory)
+    shutil.copytree(GOLDEN / str(schema), directory)
     run = maxent_jax.load_run(directory)
-    expected = np.load(GOLDEN.with_suffix(".npz"))
+    expected = np.load(GOLDEN / "expected.npz")
     states = jax.numpy.asarray(expected["states"])
     np.testing.assert_array_equal(run.histogram, expected["histogram"])
     for i in range(run.num_policies):
         actions = run.policy(i)(states, jax.random.key(0))
         np.testing.assert_allclose(actions, expected["actions"][i], atol=1e-5)
-    assert restored(directory).learner.env_steps == 400
     assert sum(path.stat().st_size for path in GOLDEN.rglob("*") if path.is_file()) < 1e6
+    again = ["--resume", "--out", str(directory)]
+    if schema in files.RESUMABLE:
+        assert restored(directory).learner.env_steps == 400
+        assert train.read_arguments(again).config == run.config
+    else:
+        with pytest.raises(errors.RunError, match=f"it has schema {schema}, and this release"):
+            train.check_free(train.read_arguments(again))
 
 
 @jax.tree_util.register_pytree_node_class

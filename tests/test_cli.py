@@ -49,7 +49,7 @@ def ended(raised, capsys):
 
 
 def test_help_is_printed_where_letters_are_missing():
-    done = shell('"$@"', "train", "--help", PYTHONIOENCODING="ascii")
+    done = shell('"$@"', "train", "--help-all", PYTHONIOENCODING="ascii")
     assert done.returncode == 0 and not done.stderr
     assert b"lambda of the episodic term" in done.stdout.replace(b"\n", b" ")
 

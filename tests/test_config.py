@@ -1,12 +1,10 @@
 """Values that no run can have are refused in one sentence, before anything is loaded."""
 
-import dataclasses
-
 import pytest
 
-from maxent_jax.config import Config, preset
-from maxent_jax.config.names import ENVS, METHODS
+from maxent_jax.config import from_flat, preset
 from maxent_jax.config.presets import PRESETS
+from maxent_jax.config.registry import ENVS, METHODS
 from maxent_jax.errors import ConfigError
 
 
@@ -14,7 +12,7 @@ from maxent_jax.errors import ConfigError
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_are_valid_in_every_environment_and_survive_a_round_trip(name, env):
     config = preset(name, env=env)
-    assert Config(**dataclasses.asdict(config)) == config
+    assert from_flat(config.flat()) == config
     assert hash(config) == hash(preset(name, env=env))
     if name == "paper":
         assert config.deviations() == {}
@@ -85,7 +83,7 @@ def test_quick_names_its_deviations_and_paper_has_none():
 
 
 def test_an_environment_that_has_v_start_from_scratch_leaves_the_others_their_own_start():
-    starts = {m: preset("quick", env="walker2d", method=m).start for m in METHODS}
+    starts = {m: preset("quick", env="walker2d", method=m).mixture.start for m in METHODS}
     assert starts.pop("v") == "scratch"
     assert set(starts.values()) == {"method"}
 
@@ -103,15 +101,14 @@ def test_a_hybrid_of_methods_is_named():
 
 
 def test_choices_are_those_of_the_modules_that_make_them():
-    from maxent_jax import envs, intrinsic, rewards
-    from maxent_jax.algorithm import methods
-    from maxent_jax.config import names
+    from maxent_jax import envs, rewards
+    from maxent_jax.config import names, registry
+    from maxent_jax.envs.task import MujocoEnv
 
-    torsos = {name: task.torso for name, task in envs.TASKS.items() if task.torso is not None}
-    assert set(names.MUJOCO_ENVS) == set(envs.TASKS)
-    assert set(names.CLASSIC_ENVS) == set(envs.CLASSIC)
-    assert set(names.TORSO_ENVS) == set(torsos)
-    assert set(names.METHODS) == set(methods.ROWS)
-    assert set(names.BONUSES) == set(intrinsic.NAMES)
+    for name in ENVS:
+        row, env = registry.environment(name), envs.make(name)
+        assert row.is_robot == isinstance(env, MujocoEnv)
+        assert row.has_torso == (envs.entry(name).torso is not None)
+    for row in registry.BONUSES.values():
+        assert callable(registry.resolve(row.make))
     assert set(names.REWARDS) == set(rewards.FORMS)
-    assert set(names.STARTS) == {"method", *methods.STARTS}

@@ -82,7 +82,7 @@ def test_an_action_leads_on_as_in_gymnasium(rows):
 
 @pytest.mark.slow
 def test_policies_play_by_weight(run):
-    weighted = dataclasses.replace(run, config=dataclasses.replace(run.config, method="h", eta=0.3))
+    weighted = dataclasses.replace(run, config=run.config.replace(method="h", eta=0.3))
     rows = weighted.dataset(20_000)
     played = np.bincount(rows["policy"][rows["terminals"] | rows["timeouts"]], minlength=3)
     expected = weighted.weights * played.sum()

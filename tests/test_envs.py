@@ -11,7 +11,7 @@ from brax import envs as brax_envs
 from brax.envs.wrappers import training
 
 from maxent_jax import envs, features
-from maxent_jax.config.names import BACKENDS, BRAX_ENVS, ENVS, PHYSICS
+from maxent_jax.config.registry import BACKENDS, BRAX_ENVS, PHYSICS
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import task
 from maxent_jax.errors import ConfigError
@@ -98,7 +98,6 @@ def test_auto_is_c_on_a_cpu_and_mjx_elsewhere(monkeypatch, platform, backend):
 
 
 def test_the_names_are_those_of_the_config():
-    assert {*envs.TASKS, *envs.CLASSIC} == set(ENVS)
     assert set(brax_envs._envs) - {"fast"} == set(BRAX_ENVS)  # fast is brax's own test
     assert set(BACKENDS) == {"auto", "mjx", "mujoco", "warp"}
     assert set(PHYSICS) == {"reference", "fast"}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from maxent_jax import features
-from maxent_jax.config.names import CLASSIC_ENVS, MUJOCO_ENVS
+from maxent_jax.config.registry import CLASSIC_ENVS, MUJOCO_ENVS
 from maxent_jax.errors import ConfigError
 from maxent_jax.features import make_feature_map
 

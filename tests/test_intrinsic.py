@@ -9,6 +9,7 @@ import pytest
 from scipy.special import digamma
 
 from maxent_jax import intrinsic, moments
+from maxent_jax.config.registry import BONUSES
 from maxent_jax.intrinsic import Setting, Steps, kmeans, ngu, particles, rise, vcse
 
 D, A, B = 3, 2, 24
@@ -100,7 +101,7 @@ def kinds(tree):
     return jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), tree)
 
 
-@pytest.mark.parametrize("name", intrinsic.NAMES)
+@pytest.mark.parametrize("name", BONUSES)
 class TestEveryBonus:
     def test_rewards_are_finite_also_where_states_coincide_and_nothing_compiles_twice(self, name):
         _, init, step = made(name)
@@ -150,7 +151,7 @@ class TestEveryBonus:
 
 
 def test_a_name_a_scale_or_a_batch_that_does_not_fit_is_refused():
-    with pytest.raises(ValueError, match="unknown bonus 'curiosity': choose one of rnd, icm"):
+    with pytest.raises(ValueError, match="unknown bonus 'curiosity': did you mean 'rise'"):
         intrinsic.make("curiosity", D, A, jnp.ones(D), RATE, CELLS)
     with pytest.raises(ValueError, match=r"scale has shape \(2,\), but must be \(3,\)"):
         intrinsic.make("rnd", D, A, jnp.ones(2), RATE, CELLS)

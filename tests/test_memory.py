@@ -1,12 +1,10 @@
 """Estimates of memory, held against the states themselves and against XLA's own account."""
 
-import dataclasses
-
 import jax
 import pytest
 
 from maxent_jax import algorithm
-from maxent_jax.config import Config, preset
+from maxent_jax.config import from_flat, preset
 from maxent_jax.errors import ConfigError
 from maxent_jax.runs import machine, memory
 from maxent_jax.runs.machine import Room
@@ -29,7 +27,7 @@ def test_the_state_is_estimated_exactly(smoke):
 
 @pytest.mark.slow
 def test_the_estimate_is_below_what_xla_allocates(smoke):
-    config = dataclasses.replace(smoke, hidden_size=256, replay_size=100_000, batch_size=1000)
+    config = smoke.replace(hidden_size=256, replay_size=100_000, batch_size=1000)
     state = algorithm.start(config)
     needed = 0
     for function in algorithm.programs(config):
@@ -71,7 +69,7 @@ def test_a_run_that_cannot_fit_is_refused_by_what_takes_most(monkeypatch, settin
     with pytest.raises(ConfigError) as refused:
         memory.check(config, jax.devices()[:1])
     said = str(refused.value)
-    assert said.startswith(f"{setting} is {getattr(config, setting.replace('-', '_'))}, with")
+    assert said.startswith(f"{setting} is {config[setting.replace('-', '_')]}, with")
     assert "but this machine has 8 GiB" in said
     memory.check(preset("smoke", env="pendulum"), jax.devices()[:1])
 
@@ -82,14 +80,14 @@ def test_a_run_that_cannot_fit_is_refused_by_what_takes_most(monkeypatch, settin
 )
 def test_sizes_that_nothing_can_count_are_refused_before_jax_is_asked(name, size):
     with pytest.raises(ConfigError, match=f"{name.replace('_', '-')} is {size}, but must be"):
-        Config(**{name: size})
+        from_flat({name: size})
 
 
 def test_devices_share_what_they_can(smoke):
     one, two = memory.on_a_device(smoke), memory.on_a_device(smoke, 2)
     assert two["replay-size"] == one["replay-size"] // 2
     assert two["hidden-size"] == one["hidden-size"]
-    of_four = dataclasses.replace(smoke, num_seeds=4)
+    of_four = smoke.replace(num_seeds=4)
     assert memory.on_a_device(of_four, 2)["hidden-size"] == 2 * one["hidden-size"]
 
 

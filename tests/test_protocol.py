@@ -1,7 +1,6 @@
 """Studies: equal budgets and one projection for all methods, and no finished cell twice."""
 
 import csv
-import dataclasses
 import json
 import os
 import signal
@@ -34,10 +33,13 @@ def test_all_methods_of_a_study_have_one_budget_and_one_environment(name, scale)
         own = [cell for cell in cells if cell.config.env == env]
         budgets = {
             (
-                c.steps_per_iteration * c.num_iterations,
-                c.vector_steps * c.num_segments * c.num_iterations * c.updates_per_vector_step,
-                c.mixture_episodes * c.episode_length,
-                c.batch_size,
+                c.budget.steps_per_iteration * c.budget.num_iterations,
+                c.vector_steps
+                * c.budget.num_segments
+                * c.budget.num_iterations
+                * c.updates_per_vector_step,
+                c.mixture.mixture_episodes * c.environment.episode_length,
+                c.learner.batch_size,
             )
             for c in (cell.config for cell in own)
         }
@@ -60,8 +62,8 @@ def test_methods_that_are_compared_by_their_rewards_have_one_learner(name, scale
     rewards = {"method", "bonus", "mixing", "leave_own_out", "reward_scale"}
     for cell in (cells := protocol.make(name, scale)):
         of_env = [other for other in cells if other.config.env == cell.config.env]
-        fields = dataclasses.asdict(cell.config)
-        other = dataclasses.asdict(of_env[0].config)
+        fields = cell.config.flat()
+        other = of_env[0].config.flat()
         differing = {field for field in fields if fields[field] != other[field]}
         differing -= {"seed", "random_baseline"}  # a random policy beside it is no learner
         if cell.config.method not in ("h", "la", "v"):
@@ -124,7 +126,7 @@ def test_a_directory_belongs_to_one_study_and_may_gain_seeds(tmp_path):
     held = json.loads((directory / protocol.STUDY).read_text())
     assert set(held["cells"]) == {cell.name for cell in two}
 
-    changed = [one[0]._replace(config=dataclasses.replace(one[0].config, eta=0.5))]
+    changed = [one[0]._replace(config=one[0].config.replace(eta=0.5))]
     with pytest.raises(errors.UsageError, match=r"eta was 0\.1 and is 0\.5; choose another --out"):
         protocol.claim(directory, "fig4", "cpu", changed)
     with pytest.raises(errors.UsageError, match="scale is cpu, not paper"):
@@ -134,7 +136,7 @@ def test_a_directory_belongs_to_one_study_and_may_gain_seeds(tmp_path):
     earlier = held | {"cells": held["cells"] | {name: before}}  # of a release without that field
     (directory / protocol.STUDY).write_text(json.dumps(earlier))
     protocol.claim(directory, "fig4", "cpu", one)
-    stale = [one[0]._replace(config=dataclasses.replace(one[0].config, stale_rewards=True))]
+    stale = [one[0]._replace(config=one[0].config.replace(stale_rewards=True))]
     (directory / protocol.STUDY).write_text(json.dumps(earlier))
     with pytest.raises(errors.UsageError, match="stale_rewards was False and is True"):
         protocol.claim(directory, "fig4", "cpu", stale)
@@ -308,7 +310,7 @@ def test_what_methods_differ_in_as_a_number_is_an_axis():
         if study.along:
             cells = protocol.make(name, "cpu", 1)
             found[name] = {c.method: results.ALONG[study.along][1](c.config) for c in cells}
-    iteration = protocol.make("refresh", "cpu", 1)[0].config.steps_per_iteration
+    iteration = protocol.make("refresh", "cpu", 1)[0].config.budget.steps_per_iteration
     assert list(found) == ["refresh", "refresh_classic", "episodic"]
     assert list(found["refresh"].values()) == [64, 640, 6400, iteration]
     assert list(found["episodic"].values()) == [0, 0.01, 0.1, 1]
@@ -354,7 +356,7 @@ def test_the_raw_values_are_those_of_the_runs(finished):
     with open(out / "fig4" / "raw.csv") as file:
         rows = list(csv.DictReader(file))
     cells = protocol.make("fig4", "toy", 1)
-    iterations = cells[0].config.num_iterations
+    iterations = cells[0].config.budget.num_iterations
     assert len(rows) == (len(cells) + 1) * iterations  # and the random policy
     for cell in cells:
         kept = files.read_metrics(out / "fig4" / cell.name)
@@ -454,7 +456,7 @@ def test_mepol_has_the_env_steps_of_the_study_and_is_computed_once(tmp_path, mon
     config = preset("smoke", env="pendulum", num_seeds=2)
     found = mepol_values.rows(tmp_path, config, 2)
     assert [(row["seed"], row["iteration"], row["env_steps"]) for row in found] == [
-        (seed, i, i * config.steps_per_iteration) for i in (1, 2) for seed in (0, 1)
+        (seed, i, i * config.budget.steps_per_iteration) for i in (1, 2) for seed in (0, 1)
     ]
     assert {row["method"] for row in found} == {mepol_values.METHOD}
     monkeypatch.setattr(mepol_values, "_train", None)  # a second time would fail

@@ -99,7 +99,7 @@ def test_the_page_holds_the_metrics_of_every_seed(page, directory):
 
 def test_every_setting_and_every_departure_is_there(page, directory):
     config = files.read_config(directory)
-    for name, value in dataclasses.asdict(config).items():
+    for name, value in config.flat().items():
         assert re.search(rf"\b{name}\s*{re.escape(str(value))}", page.text), name
     for why in config.deviations().values():
         assert why in page.text

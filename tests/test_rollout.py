@@ -107,7 +107,7 @@ def make_archive(p, size):
 
 def make_starts(p):
     """Starts of 8 episodes, of which the first three leave the ground for good at once."""
-    episodes = base.init(p.env, p.config.mixture_episodes, 64, jax.random.key(3))
+    episodes = base.init(p.env, p.config.mixture.mixture_episodes, 64, jax.random.key(3))
     start = episodes.env.pipeline_state
     leaping = start._replace(qvel=start.qvel.at[:3, 2].set(8.0))
     return episodes.env.replace(pipeline_state=leaping)
@@ -125,7 +125,7 @@ def visited(request):
 
 def test_a_mixtures_states_weigh_one_in_all(visited):
     config, found = visited
-    rows = config.mixture_episodes * config.episode_length
+    rows = config.mixture.mixture_episodes * config.environment.episode_length
     assert found.states.shape == (rows, 29) and found.features.shape == (rows, 7)
     assert found.num_invalid == 0
     # Sums of 800 float32 of that size.
@@ -139,7 +139,7 @@ def test_policies_weigh_as_told_or_by_the_states_they_reach(visited):
     lived = np.bincount(policy[alive], minlength=3)
     share = np.bincount(policy, weight, minlength=3)
     assert lived[0] < lived[1] / 2  # so the two ways to weigh are far apart
-    expected = lived / lived.sum() if config.pooled else WEIGHTS
+    expected = lived / lived.sum() if config.mixture.pooled else WEIGHTS
     np.testing.assert_allclose(share, expected, atol=1e-5)
     for one in range(3):
         own = weight[(policy == one) & alive]
@@ -149,9 +149,9 @@ def test_policies_weigh_as_told_or_by_the_states_they_reach(visited):
 def test_episodes_are_shared_among_the_policies(visited):
     config, found = visited
     played = np.bincount(found.episode_policy, minlength=3)
-    shares = np.asarray(WEIGHTS) if config.pooled else np.full(3, 1 / 3)
-    assert (np.abs(played - shares * config.mixture_episodes) < 1).all()
-    grid = np.asarray(found.policy).reshape(config.episode_length, -1)
+    shares = np.asarray(WEIGHTS) if config.mixture.pooled else np.full(3, 1 / 3)
+    assert (np.abs(played - shares * config.mixture.mixture_episodes) < 1).all()
+    grid = np.asarray(found.policy).reshape(config.environment.episode_length, -1)
     np.testing.assert_array_equal(grid, np.broadcast_to(found.episode_policy, grid.shape))
 
 
@@ -276,15 +276,17 @@ def archive_of(size, capacity=4):
 def expected_scores(found, points, rows, config, size, capacity=4):
     """By hand, in float64: for each state, a sorted list of the distances it may see."""
     policy, alive, rows = (np.asarray(x) for x in (found.policy, found.alive, rows))
-    iteration = -(-policy // config.snapshots)
+    iteration = -(-policy // config.mixture.snapshots)
     total, lived = np.zeros(capacity), np.zeros(capacity)
     for i in np.flatnonzero(alive):
         hidden = rows == i
-        if config.leave_own_out and size > 1:
+        if config.mixture.leave_own_out and size > 1:
             hidden = (rows >= 0) & (iteration[rows] == iteration[i])
         difference = np.float64(points) - np.float64(found.features[i])
         distances = np.sort(np.sqrt((difference[~hidden] ** 2).sum(1)))
-        total[policy[i]] += np.log1p(distances[config.num_neighbors - 1] / config.reward_distance)
+        total[policy[i]] += np.log1p(
+            distances[config.intrinsic.num_neighbors - 1] / config.intrinsic.reward_distance
+        )
         lived[policy[i]] += 1
     played = np.bincount(found.episode_policy, minlength=capacity)
     return total / np.maximum(played, 1), total / np.maximum(lived, 1)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from maxent_jax import errors, mixture
-from maxent_jax.algorithm import methods
 from maxent_jax.commands import theory
+from maxent_jax.config.registry import METHODS, STARTS
 from maxent_jax.theory import bounds, loop, mdps, optimum, peers, reference, tabular
 from maxent_jax.theory.loop import Settings
 
@@ -19,7 +19,7 @@ GARNET = mdps.garnet(8, 3, 2, seed=2)
 DISCOUNT, SMOOTHING = 0.9, 1 / 8
 MDP = mdps.discounted(GARNET, DISCOUNT)
 STEPS = tabular.converged_steps(MDP)
-V, LA, H = (methods.ROWS[name] for name in ("v", "la", "h"))
+V, LA, H = (METHODS[name] for name in ("v", "la", "h"))
 
 
 def first_policies(mdp, number):
@@ -112,7 +112,7 @@ def test_official_weights_forget_all_but_a_few_policies_however_long_the_run(eta
     assert weights[-1] == pytest.approx(np.sqrt(2 * eta), rel=0.2)  # where a step would be η
 
 
-@pytest.mark.parametrize("start", methods.STARTS)
+@pytest.mark.parametrize("start", STARTS)
 def test_once_planning_has_converged_its_start_does_not_matter(start):
     found = run(V._replace(start=start))
     np.testing.assert_allclose(found.objective, run(V).objective, atol=1e-9)

@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks import common
 from maxent_jax import components, envs, features, load_run, mixture, rewards
 from maxent_jax.analysis import Paths, Run
-from maxent_jax.config import Config, preset
+from maxent_jax.config import from_flat, preset
 from maxent_jax.density import entropy, histogram, knn
 from maxent_jax.density.histogram import Grid
 from maxent_jax.errors import CheckpointError, ConfigError, ConfigTypeError, RunError
@@ -77,7 +77,7 @@ def knn_of(what: str, kind: type[Exception], says: str, *args: Any, **kwargs: An
 
 def config_of(kind: type[Exception], says: str, **settings: Any) -> Fault:
     """Settings that no run can have."""
-    return Fault(f"Config({settings})", lambda _: Config(**settings), kind, says)
+    return Fault(f"from_flat({settings})", lambda _: from_flat(settings), kind, says)
 
 
 def of(call: Callable[[Places], Any], kind: type[Exception], says: str) -> Fault:

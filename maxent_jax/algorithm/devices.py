@@ -30,9 +30,9 @@ def make_mesh(config: Config, devices: Sequence[jax.Device]) -> Mesh:
     across_seeds = math.gcd(config.num_seeds, len(devices))
     sharing = len(devices) // across_seeds
     for name in ("num_envs", "replay_size"):
-        if getattr(config, name) % sharing:
+        if config[name] % sharing:
             raise ConfigError(
-                f"{name.replace('_', '-')} is {getattr(config, name)}, but must be a multiple of "
+                f"{name.replace('_', '-')} is {config[name]}, but must be a multiple of "
                 f"{sharing}: so many devices share a seed."
             )
     axis_types = (AxisType.Auto, AxisType.Auto)

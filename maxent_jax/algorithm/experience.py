@@ -47,19 +47,19 @@ class Step(NamedTuple):
 def init(components: Components) -> Replay:
     """An empty replay."""
     config = components.config
-    scalar, variants = jnp.zeros(()), jnp.zeros(1 + config.yaw_copies)
+    scalar, variants = jnp.zeros(()), jnp.zeros(1 + config.learner.yaw_copies)
     step = Step(
-        state=jnp.zeros(components.num_seen, config.replay_dtype),
-        features=jnp.zeros((1 + config.yaw_copies, len(components.phi.names))),
+        state=jnp.zeros(components.num_seen, config.learner.replay_dtype),
+        features=jnp.zeros((1 + config.learner.yaw_copies, len(components.phi.names))),
         previous=jnp.zeros((), jnp.int32),
         following=jnp.zeros((), jnp.int32),
         action=jnp.zeros(components.sac.action_size),
         terminated=jnp.zeros((), bool),
         bonus=scalar,
-        angle=variants[1:] if config.yaw_copies else None,
+        angle=variants[1:] if config.learner.yaw_copies else None,
         distances=Distances(variants, variants, variants),
     )
-    return replay.init(step, config.replay_size)
+    return replay.init(step, config.learner.replay_size)
 
 
 def add(
@@ -80,8 +80,8 @@ def add(
     """
     config = components.config
     angle = None
-    if config.yaw_copies:
-        shape = (transition.valid.shape[0], config.yaw_copies)
+    if config.learner.yaw_copies:
+        shape = (transition.valid.shape[0], config.learner.yaw_copies)
         angle = jax.random.uniform(key, shape, minval=-jnp.pi, maxval=jnp.pi)
         goes_on = (previous >= 0)[:, None]
         angle = jnp.where(goes_on, ring.items.angle[jnp.maximum(previous, 0)], angle)
@@ -101,7 +101,7 @@ def add(
     )
     rows = replay.destinations(ring, transition.valid)
     ring = replay.add(ring, step, transition.valid)
-    links = jnp.where(transition.valid & (previous >= 0), previous, config.replay_size)
+    links = jnp.where(transition.valid & (previous >= 0), previous, config.learner.replay_size)
     following = ring.items.following.at[links].set(rows, mode="drop")
     return ring._replace(items=ring.items._replace(following=following)), rows
 
@@ -119,9 +119,9 @@ def sample(
     config = components.config
     key_rows, key_variant = jax.random.split(key)
     items: Step = ring.items
-    first = replay.draw(ring, shape, key_rows, skip=STEPS_WITHOUT_START * config.num_envs)
+    first = replay.draw(ring, shape, key_rows, skip=STEPS_WITHOUT_START * config.budget.num_envs)
     rows, taken = [first], [jnp.ones(shape, bool)]
-    for _ in range(config.return_steps - 1):
+    for _ in range(config.learner.return_steps - 1):
         following = items.following[rows[-1]]
         taken.append(taken[-1] & (following >= 0))
         rows.append(jnp.where(taken[-1], following, rows[-1]))
@@ -134,7 +134,7 @@ def sample(
     before = _features_left(components, items, starts, first)
     variant = jnp.zeros(shape, jnp.int32)
     if items.angle is not None:
-        variant = jax.random.randint(key_variant, shape, 0, 1 + config.yaw_copies)
+        variant = jax.random.randint(key_variant, shape, 0, 1 + config.learner.yaw_copies)
         angle = _chosen(items.angle[first], jnp.maximum(variant - 1, 0))
         turned = (variant > 0)[..., None]
         rotate = lambda state: jnp.where(turned, _rotated(components, state, angle), state)
@@ -182,15 +182,15 @@ def measure(
         nearest = knn_distances(
             features.reshape(-1, dims),
             reference.points[:, :dims],
-            config.num_neighbors,
+            config.intrinsic.num_neighbors,
             count=reference.num_filled,
         )
         return nearest[:, -1].reshape(features.shape[:-1])
 
     reached = distance(after)
-    if config.shaping == 0:
+    if config.intrinsic.shaping == 0:
         return Distances(reached, jnp.zeros_like(reached), jnp.zeros_like(reached))
-    if config.shaping_space == "features":
+    if config.intrinsic.shaping_space == "features":
         return Distances(reached, distance(before), reached)
     potential, next_potential = distance(jnp.stack([before, after])[..., :POSITION_DIMS])
     return Distances(reached, potential, next_potential)
@@ -235,7 +235,7 @@ def _chosen(values: jax.Array, index: jax.Array, axis: int = -1) -> jax.Array:
 
 
 def _encoded(components: Components, state: jax.Array) -> jax.Array:
-    dtype, seen = components.config.replay_dtype, state[..., : components.num_seen]
+    dtype, seen = components.config.learner.replay_dtype, state[..., : components.num_seen]
     if dtype == "float32":
         return seen
     largest = jnp.finfo(dtype).max

@@ -24,7 +24,7 @@ from maxent_jax.algorithm.experience import Reference
 from maxent_jax.algorithm.training import Learner
 from maxent_jax.components import Components
 from maxent_jax.config import Config
-from maxent_jax.config.names import CORRECTIVE
+from maxent_jax.config.registry import CORRECTIVE, STARTS
 from maxent_jax.density import histogram, reservoir
 from maxent_jax.envs import base
 from maxent_jax.mixture import Archive, occupancy
@@ -95,23 +95,23 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
     key_starts, key_rollout, key_rows, key_history, key_scratch = keys
 
     weights = method.weights[archive.size - 1]
-    starts = base.draw_starts(learner.episodes.starts, config.mixture_episodes, key_starts)
+    starts = base.draw_starts(learner.episodes.starts, config.mixture.mixture_episodes, key_starts)
     visited = occupancy.of_mixture(p, archive, weights, starts, key_rollout)
     visited, weights = occupancy.corrected(p, visited, weights)
 
     # Before there is a history, the first rollouts stand in for one.
     unseen = (learner.history.seen == 0) & visited.alive
     history = reservoir.add(learner.history, visited.features, unseen, key_history)
-    rows = mixture.draw_rows(visited.weight, config.reference_size, key_rows)
+    rows = mixture.draw_rows(visited.weight, config.mixture.reference_size, key_rows)
     rows = jnp.where(method.from_history, -1, rows)
     reference = Reference(
         jnp.where(method.from_history, history.points, visited.features[rows]),
-        jnp.where(method.from_history, reservoir.count(history), config.reference_size),
+        jnp.where(method.from_history, reservoir.count(history), config.mixture.reference_size),
     )
     scores = occupancy.score(p, visited, reference.points, rows, archive, reference.num_filled)
     best = occupancy.best(scores, visited)
     replay = learner.replay
-    if not p.config.stale_rewards:
+    if not p.config.intrinsic.stale_rewards:
         replay = experience.measure_all(p, reference, replay, learner.episodes.starts.obs)
     learner = learner._replace(
         agent=_start(p, method, archive, learner.agent, best, key_scratch),
@@ -125,7 +125,7 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
         "num_rollout_steps": jnp.sum(visited.alive, dtype=jnp.int32),
         "num_rollout_invalid": visited.num_invalid,
     }
-    if p.config.mixing == "episode":  # else no state is a policy's
+    if p.config.mixture.mixing == "episode":  # else no state is a policy's
         metrics |= {
             "best_policy": best,
             "policy_return": scores.episode_return,
@@ -149,16 +149,16 @@ def train_segment(config: Config, state: State) -> tuple[State, Metrics]:
     keys = jax.random.split(key_steps, config.vector_steps)
     learner, metrics = jax.lax.scan(step, state.learner, keys)
     archive = state.archive
-    if config.snapshots > 1:
+    if config.mixture.snapshots > 1:
         archive = mixture.append(archive, agent.archived(learner.agent), _due(config, learner))
     return state._replace(key=key, learner=learner, archive=archive), reduce_metrics(metrics)
 
 
 def _due(config: Config, learner: Learner) -> jax.Array:
     """Whether a snapshot is taken after this segment; that of an iteration's last is `end`'s."""
-    segments = learner.env_steps // (config.vector_steps * config.num_envs)
-    within = segments % config.num_segments
-    return (within > 0) & (within % (config.num_segments // config.snapshots) == 0)
+    segments = learner.env_steps // (config.vector_steps * config.budget.num_envs)
+    within = segments % config.budget.num_segments
+    return (within > 0) & (within % (config.budget.num_segments // config.mixture.snapshots) == 0)
 
 
 @in_32_bits
@@ -171,11 +171,15 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
     key_starts, key_rollout, key_rows = jax.random.split(jax.random.key(EVALUATION_SEED), 3)
 
     def roll_out(weights, key_starts, key_rollout):
-        starts = base.draw_starts(learner.episodes.starts, config.mixture_episodes, key_starts)
-        deterministic = p.config.deterministic
+        starts = base.draw_starts(
+            learner.episodes.starts, config.mixture.mixture_episodes, key_starts
+        )
+        deterministic = p.config.evaluation.deterministic
         return occupancy.of_mixture(p, archive, weights, starts, key_rollout, True, deterministic)
 
-    if p.config.weights == CORRECTIVE:  # fitted to other episodes than those that are measured
+    if (
+        p.config.mixture.weights == CORRECTIVE
+    ):  # fitted to other episodes than those that are measured
         fitted_to = roll_out(weights, *jax.random.split(jax.random.key(EVALUATION_SEED + 1)))
         _, weights = occupancy.corrected(p, fitted_to, weights)
     visited = roll_out(weights, key_starts, key_rollout)
@@ -187,7 +191,7 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
         "mixture_weights": weights,
         "effective_policies": jnp.exp(histogram.shannon_entropy(weights)),
         **coverage("cumulative", learner.visits),
-        **(coverage("random", learner.random_visits) if config.random_baseline else {}),
+        **(coverage("random", learner.random_visits) if config.evaluation.random_baseline else {}),
         **occupancy.measures(p, visited, key_rows),
     }
     return state, metrics
@@ -198,7 +202,7 @@ def iterate(config: Config, state: State) -> tuple[State, Metrics]:
     """One iteration of Algorithm 1."""
     state, at_begin = begin(config, state)
     state, in_segments = jax.lax.scan(
-        lambda s, _: train_segment(config, s), state, length=config.num_segments
+        lambda s, _: train_segment(config, s), state, length=config.budget.num_segments
     )
     state, at_end = end(config, state)
     return state, at_begin | reduce_metrics(in_segments) | at_end
@@ -264,13 +268,13 @@ def _start(
     best: jax.Array,
     key: jax.Array,
 ) -> Agent:
-    """The agent that the iteration starts from, as methods.STARTS says."""
+    """The agent that the iteration starts from, as STARTS says."""
     scratch = agent.init(p.sac, key)
     restored = agent.restart(p.sac, mixture.policy(archive, best))
     candidates = dict(scratch=scratch, last=last, best=restored)
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *(candidates[name] for name in methods.STARTS))
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *(candidates[name] for name in STARTS))
     chosen = jax.tree.map(lambda x: x[method.start], stacked)
-    if not p.config.restart_temperature:
+    if not p.config.learner.restart_temperature:
         return chosen
     initial = scratch.parameters.log_temperature
     return chosen._replace(parameters=chosen.parameters._replace(log_temperature=initial))

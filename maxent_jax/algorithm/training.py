@@ -53,25 +53,25 @@ def init(components: Components, key: jax.Array) -> Learner:
     """A fresh learner with fresh episodes, an empty replay, and no reference yet."""
     config, sac = components.config, components.sac
     key_agent, key_episodes, key_bonus = jax.random.split(key, 3)
-    num_rows = config.num_envs * (2 if config.random_baseline else 1)
+    num_rows = config.budget.num_envs * (2 if config.evaluation.random_baseline else 1)
     dims = len(components.phi.names)
-    episodes = base.init(components.env, num_rows, config.num_starts, key_episodes)
+    episodes = base.init(components.env, num_rows, config.environment.num_starts, key_episodes)
     episodic = components.bonus and components.bonus.episodic
     remembered = episodic.size if episodic else dims
     memory = None
-    if config.episodic_weight > 0 or episodic:
-        memory = jnp.zeros((config.num_envs, config.episode_length, remembered))
+    if config.intrinsic.episodic_weight > 0 or episodic:
+        memory = jnp.zeros((config.budget.num_envs, config.environment.episode_length, remembered))
     zero = jnp.zeros((), jnp.int32)
     unvisited = Visits(jnp.zeros(components.grid.bins, jnp.int32), zero)
     return Learner(
         agent=sac_agent.init(sac, key_agent),
         replay=experience.init(components),
-        place=-1 - episodes.start[: config.num_envs],
+        place=-1 - episodes.start[: config.budget.num_envs],
         episodes=episodes,
         memory=memory,
         bonus=components.bonus.init(key_bonus) if components.bonus else None,
-        reference=Reference(jnp.zeros((config.reference_size, dims)), zero),
-        history=reservoir.init(config.reference_size, dims),
+        reference=Reference(jnp.zeros((config.mixture.reference_size, dims)), zero),
+        history=reservoir.init(config.mixture.reference_size, dims),
         visits=unvisited,
         random_visits=unvisited,
         env_steps=zero,
@@ -87,17 +87,17 @@ def step(
     key_act, key_random, key_env, key_history, key_yaw, key_learn = jax.random.split(key, 6)
 
     policy = learner.agent.parameters.policy
-    observation = learner.episodes.env.obs[: config.num_envs]
+    observation = learner.episodes.env.obs[: config.budget.num_envs]
     action = sac_agent.act(components.sac, policy, observation, key_act)
-    if config.random_baseline:
+    if config.evaluation.random_baseline:
         random = jax.random.uniform(key_random, action.shape, minval=-1.0, maxval=1.0)
         action = jnp.concatenate([action, random])
-    age = learner.episodes.age[: config.num_envs]
+    age = learner.episodes.age[: config.budget.num_envs]
     episodes, everyone = base.step(
-        components.env, learner.episodes, action, config.episode_length, key_env
+        components.env, learner.episodes, action, config.environment.episode_length, key_env
     )
-    transition = jax.tree.map(lambda x: x[: config.num_envs], everyone)
-    others = jax.tree.map(lambda x: x[config.num_envs :], everyone)
+    transition = jax.tree.map(lambda x: x[: config.budget.num_envs], everyone)
+    others = jax.tree.map(lambda x: x[config.budget.num_envs :], everyone)
 
     features = components.phi(transition.next_observation)
     history = reservoir.add(learner.history, features, transition.valid, key_history)
@@ -110,7 +110,7 @@ def step(
     learner = learner._replace(
         agent=sac_agent.see(components.sac, learner.agent, observation, transition.valid),
         replay=ring,
-        place=jnp.where(ended, -1 - episodes.start[: config.num_envs], rows),
+        place=jnp.where(ended, -1 - episodes.start[: config.budget.num_envs], rows),
         episodes=episodes,
         memory=memory,
         bonus=bonus,
@@ -120,7 +120,7 @@ def step(
         random_visits=visit(
             components, learner.random_visits, others.next_observation, others.valid
         ),
-        env_steps=learner.env_steps + config.num_envs,
+        env_steps=learner.env_steps + config.budget.num_envs,
         gradient_steps=learner.gradient_steps + config.updates_per_vector_step,
     )
     learner, metrics = _learn(components, method, learner, key_learn)
@@ -142,29 +142,33 @@ def unshaped_reward(components: Components, distance: jax.Array) -> jax.Array:
     """r_t of a state at that distance, [...] -> [...]: what scores and plots use."""
     config = components.config
     return rewards.of_distance(
-        distance, config.reward, config.reward_distance, len(components.phi.names)
+        distance,
+        config.intrinsic.reward,
+        config.intrinsic.reward_distance,
+        len(components.phi.names),
     )
 
 
 def reward(components: Components, outcomes: Outcomes) -> jax.Array:
     """What SAC is paid for each step, [...]: r_t, shaping, the episodic term, and for living."""
-    config = components.config
-    distances = outcomes.distances
-    paid = unshaped_reward(components, distances.reached) + config.episodic_weight * outcomes.bonus
-    if config.shaping > 0:
+    own, distances = components.config.intrinsic, outcomes.distances
+    paid = unshaped_reward(components, distances.reached) + own.episodic_weight * outcomes.bonus
+    if own.shaping > 0:
+        potential = unshaped_reward(components, distances.potential)
+        next_potential = unshaped_reward(components, distances.next_potential)
         paid = rewards.shaped(
             paid,
-            potential=config.shaping * unshaped_reward(components, distances.potential),
-            next_potential=config.shaping * unshaped_reward(components, distances.next_potential),
-            discount=config.discount,
+            potential=own.shaping * potential,
+            next_potential=own.shaping * next_potential,
+            discount=components.config.learner.discount,
             alive=1.0 - outcomes.terminated,
-            survives_death=config.shaping_survives_death,
+            survives_death=own.shaping_survives_death,
         )
-    return config.reward_scale * paid + _for_living(components, outcomes)
+    return own.reward_scale * paid + _for_living(components, outcomes)
 
 
 def _for_living(components: Components, outcomes: Outcomes) -> jax.Array:
-    return components.config.alive_bonus * (1.0 - outcomes.terminated)
+    return components.config.intrinsic.alive_bonus * (1.0 - outcomes.terminated)
 
 
 def returns(outcomes: Outcomes, paid: jax.Array, discount: float) -> tuple[jax.Array, jax.Array]:
@@ -190,7 +194,7 @@ def _refreshed(
 
     The mixture's own states change only between iterations, see algorithm.begin.
     """
-    vector_step = learner.env_steps // components.config.num_envs
+    vector_step = learner.env_steps // components.config.budget.num_envs
     period = method.refresh_period
     due = _changes_within_iteration(method) & (vector_step % jnp.maximum(period, 1) == 0)
     return Reference(
@@ -207,11 +211,11 @@ def _episodic(components, learner, transition: Transition, features, age):
     """The bonus, the memory with the states left behind, and the episodic term of those reached."""
     config, bonus, memory = components.config, learner.bonus, learner.memory
     if memory is None:
-        return bonus, memory, jnp.zeros(config.num_envs)
-    rows, left = jnp.arange(config.num_envs), components.phi(transition.observation)
+        return bonus, memory, jnp.zeros(config.budget.num_envs)
+    rows, left = jnp.arange(config.budget.num_envs), components.phi(transition.observation)
     if components.bonus is None:
         memory = memory.at[rows, age].set(left)
-        novelty = rewards.episodic_bonus(features, memory, age + 1, config.num_neighbors)
+        novelty = rewards.episodic_bonus(features, memory, age + 1, config.intrinsic.num_neighbors)
         return bonus, memory, novelty
     episodic = components.bonus.episodic
     memory = memory.at[rows, age].set(episodic.embed(bonus, left))
@@ -232,14 +236,14 @@ def _learn(
 ) -> tuple[Learner, Metrics]:
     """The gradient steps of one step of all envs, on rewards of the current reference."""
     config = components.config
-    shape = (config.updates_per_vector_step, config.batch_size)
+    shape = (config.updates_per_vector_step, config.learner.batch_size)
     key_sample, key_update = jax.random.split(key)
     drawn = experience.sample(
         components, learner.replay, learner.episodes.starts.obs, shape, key_sample
     )
     # Stored distances hold while the reference does; the branch touches the drawn rows alone.
     distances = jax.lax.cond(
-        _changes_within_iteration(method) & (not config.stale_rewards),
+        _changes_within_iteration(method) & (not config.intrinsic.stale_rewards),
         lambda x: experience.measure(components, learner.reference, x.features, x.next_features),
         lambda x: x.distances,
         drawn.outcomes,
@@ -251,7 +255,7 @@ def _learn(
     else:
         key_bonus = jax.random.fold_in(key, 2)
         bonus, paid, of_bonus = _paid_by_bonus(components, learner, drawn, key_bonus)
-    total, beyond = returns(outcomes, paid, config.discount)
+    total, beyond = returns(outcomes, paid, config.learner.discount)
     batches = losses.Batch(drawn.observation, drawn.action, total, drawn.next_observation, beyond)
 
     def update(agent, batch_and_key):
@@ -293,7 +297,7 @@ def _paid_by_bonus(
     together = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps)
     bonus, found = payer.reward(learner.bonus, together)
     size = jnp.std(found)
-    paid = components.config.reward_scale * found / jnp.maximum(size, SMALLEST_SIZE)
+    paid = components.config.intrinsic.reward_scale * found / jnp.maximum(size, SMALLEST_SIZE)
 
     def learn(bonus, batch_and_key):
         return payer.learn(bonus, *batch_and_key)

@@ -32,9 +32,9 @@ class RunTask(gymnasium.Wrapper):
         assert isinstance(controls, gymnasium.spaces.Box)
         low, high = controls.low.astype(np.float64), controls.high.astype(np.float64)
         self._control_center = (low + high) / 2
-        self._control_span = (high - low) / 2 * config.torque_limit
+        self._control_span = (high - low) / 2 * config.environment.torque_limit
         self._ended = _never
-        if config.end_flipped:
+        if config.environment.end_flipped:
             torso = components.make(config).torso
             assert torso is not None  # checked by MujocoEnv
             self._ended = jax.jit(torso.flipped)
@@ -78,10 +78,10 @@ def make(config: Config) -> RunTask:
             warnings.simplefilter("ignore", DeprecationWarning)  # v5 exists; the paper's is v4
             env = gymnasium.make(
                 IDS[config.env],
-                max_episode_steps=config.episode_length,
+                max_episode_steps=config.environment.episode_length,
                 disable_env_checker=True,
                 exclude_current_positions_from_observation=False,
-                terminate_when_unhealthy=config.end_unhealthy,
+                terminate_when_unhealthy=config.environment.end_unhealthy,
             )
     except (gymnasium.error.Error, ImportError) as error:
         reason = " ".join(str(error).split())
@@ -104,7 +104,7 @@ def play(run: Run, policies: ArrayLike, seed: int = 0) -> Paths:
     policies = np.asarray(policies)
     env = make(run.config)
     acts = {i: jax.jit(run.policy(i)) for i in np.unique(policies).tolist()}
-    length = run.config.episode_length
+    length = run.config.environment.episode_length
     states = np.zeros((len(policies), length, run.components.sac.observation_size), np.float32)
     alive = np.zeros((len(policies), length), bool)
     keys = jax.random.split(jax.random.key(seed), len(policies))

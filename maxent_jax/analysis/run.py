@@ -18,7 +18,7 @@ from maxent_jax.analysis import dataset, export
 from maxent_jax.checks import check_path, check_whole
 from maxent_jax.components import Components
 from maxent_jax.config import Config
-from maxent_jax.config.names import CORRECTIVE
+from maxent_jax.config.registry import CORRECTIVE
 from maxent_jax.density import histogram
 from maxent_jax.mixture import Archive, occupancy
 from maxent_jax.mixture.occupancy import Occupancy, Scores
@@ -70,7 +70,9 @@ class Run:
     @property
     def weights(self) -> np.ndarray:
         """[P] of the mixture's policies, 0 for empty slots."""
-        if self.config.weights == CORRECTIVE and len(self.metrics.get("mixture_weights", ())):
+        if self.config.mixture.weights == CORRECTIVE and len(
+            self.metrics.get("mixture_weights", ())
+        ):
             return self.metrics["mixture_weights"][-1].astype(np.float32)
         return np.asarray(methods.make(self.config).weights[self.num_policies - 1])
 
@@ -181,7 +183,9 @@ class Run:
     @in_32_bits
     def scores(self, visited: Occupancy, seed: int = 0) -> Scores:
         """Each policy's return under the reward that these states of the mixture define."""
-        rows = mixture.draw_rows(visited.weight, self.config.reference_size, jax.random.key(seed))
+        rows = mixture.draw_rows(
+            visited.weight, self.config.mixture.reference_size, jax.random.key(seed)
+        )
         return _score(self.components, visited, visited.features[rows], rows, self.mixture)
 
     def summaries(self, visited: Occupancy, seed: int = 0) -> list[Summary]:
@@ -209,7 +213,7 @@ class Run:
     @property
     def _components_by_policy(self) -> Components:
         """With which policies play equally often, and the states of each share its weight."""
-        return components.make(dataclasses.replace(self.config, pooled=False, mixing="episode"))
+        return components.make(self.config.replace(pooled=False, mixing="episode"))
 
     def _policy(self, index: int) -> Policy:
         check_whole("policy", index)

@@ -1,5 +1,6 @@
 """From a command line to settings: flags made from fields, one sentence for each mistake."""
 
+import dataclasses
 import functools
 import importlib
 import io
@@ -9,20 +10,27 @@ import re
 import shutil
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import redirect_stderr
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import tyro
 
 from maxent_jax.commands import streams
 from maxent_jax.commands.streams import OutputError
+from maxent_jax.config import registry
 from maxent_jax.errors import ConfigError, NonFiniteError, RunError, SaveError, UsageError
+from maxent_jax.runs import runtime
 from maxent_jax.runs.signals import Interrupted
+from maxent_jax.visual import headless
 
 NARROWEST = 40  # columns
 Arguments = TypeVar("Arguments")
+Modules = Annotated[
+    tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE"), tyro.conf.UseAppendAction
+]
+"""The type of a field for --import, which may be given more than once."""
 COMMANDS = {
     "train": "train a mixture of policies that covers the state space",
     "evaluate": "roll a run's mixture out anew: entropy, coverage, returns",
@@ -55,15 +63,25 @@ def spelled(name: str) -> str:
 
 
 def parse(
-    kind: Callable[..., Arguments], argv: Sequence[str], name: str, default: Any = None
+    kind: type[Arguments],
+    argv: Sequence[str],
+    name: str,
+    default: Any = None,
+    shown: Collection[str] = (),
 ) -> Arguments:
     """The arguments of the command of that name; --help prints the fields of `kind` and exits.
 
+    Args:
+      shown: the fields that --help shows; --help-all shows every one. All of them if left out.
     Raises:
       UsageError: an unknown flag (with the nearest one), or a value of the wrong type.
     """
     printed = io.StringIO()
     options = {} if default is None else {"default": default}
+    if shown and not {"-h", "--help"}.isdisjoint(argv):
+        options["description"] = f"{kind.__doc__} All settings: --help-all."
+        kind, options["default"] = _hiding(kind, default, shown)
+    argv = ["--help" if shown and word == "--help-all" else word for word in argv]
     try:
         with redirect_stderr(printed):
             return tyro.cli(
@@ -79,15 +97,55 @@ def parse(
         raise UsageError(_sentence(printed.getvalue())) from None
 
 
+def flag_values(argv: Sequence[str], flag: str) -> list[str]:
+    """The values that follow `--flag`, before the whole line is parsed."""
+    values: list[str] = []
+    for i, word in enumerate(argv):
+        if word == flag:
+            values += argv[i + 1 : i + 2]
+        elif word.startswith(flag + "="):
+            values.append(word.split("=", 1)[1])
+    return values
+
+
 def flag_value(argv: Sequence[str], flag: str) -> str | None:
     """The last value that follows `--flag`, before the whole line is parsed."""
-    value = None
-    for word, following in zip(argv, [*argv[1:], None], strict=True):
-        if word == flag:
-            value = following
-        elif word.startswith(flag + "="):
-            value = word.split("=", 1)[1]
-    return value
+    values = flag_values(argv, flag)
+    return values[-1] if values else None
+
+
+def import_modules(argv: Sequence[str], draws: bool = False) -> None:
+    """Imports the modules that --import names, for the environments and the like they register.
+
+    Args:
+      draws: the command draws robots, which is to be settled before MuJoCo is loaded.
+    Raises:
+      UsageError: there is no such module, or it fails.
+    """
+    modules = flag_values(argv, "--import")
+    if modules:
+        if draws:
+            headless.choose_backend()
+        else:
+            headless.draw_nothing()
+        runtime.prepare(simulates_in_jax=flag_value(argv, "--backend") == "mjx")
+        registry.import_modules(modules)
+
+
+def _hiding(kind: Any, default: Any, shown: Collection[str]) -> tuple[Any, Any]:
+    """A dataclass and its default like these, whose help shows no other fields."""
+    types: dict[str, Any] = {}
+    values: dict[str, Any] = {"__post_init__": lambda _: None, "__annotations__": types}
+    for field in dataclasses.fields(kind):
+        value, types[field.name] = getattr(default, field.name), field.type
+        if dataclasses.is_dataclass(value):
+            types[field.name], value = _hiding(type(value), value, shown)
+        elif field.name not in shown:
+            types[field.name] = Annotated[field.type, tyro.conf.Suppress]
+        values[field.name] = value
+    names = {"__module__": kind.__module__, "__doc__": kind.__doc__}
+    less: Any = dataclasses.dataclass(frozen=True)(type(kind.__name__, (kind,), names | values))
+    return less, less()
 
 
 def entry_point(main: Callable[[Sequence[str]], None]) -> Callable[[Sequence[str]], None]:

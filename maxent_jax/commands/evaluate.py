@@ -36,14 +36,18 @@ class Arguments:
     """Also play as many episodes in Gymnasium (ant, walker2d, humanoid), on C MuJoCo in float64."""
     fallback: bool = False
     """Where the last checkpoint is damaged, take the one before."""
+    modules: cli.Modules = ()
+    """A module, by name or path, that registers environments, bonuses or methods of yours."""
 
 
 def main(argv: Sequence[str]) -> None:
     """Parses and checks, and only then loads jax."""
+    cli.import_modules(argv)
     arguments = cli.parse(Arguments, argv, "evaluate")
     if arguments.episodes < 1 or arguments.seed < 0:
         raise errors.UsageError("--episodes must be at least 1, and --seed 0 or more.")
     config = files.read_config(arguments.directory)
+    config.check_registered()
     integrity.check_any(arguments.directory)
     files.check_writable(arguments.directory)
     headless.draw_nothing()
@@ -75,7 +79,7 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
         "trained_with_seed": run.seed,
         "episodes_per_policy": arguments.episodes,
         "rollout_seed": arguments.seed,
-        "reward": run.config.reward,
+        "reward": run.config.intrinsic.reward,
         "coordinates": run.components.grid.names,
         "deviations_from_the_paper": run.config.deviations(),
         "policies": [s._asdict() for s in run.summaries(visited, arguments.seed)],
@@ -83,7 +87,7 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
         "training_entropy": float(histogram.shannon_entropy(jnp.asarray(run.histogram))),
         **(
             {"random_coverage": int((run.random_histogram > 0).sum())}
-            if run.config.random_baseline
+            if run.config.evaluation.random_baseline
             else {}
         ),
         **run.measures(visited, arguments.seed),

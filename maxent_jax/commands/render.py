@@ -51,12 +51,16 @@ class Arguments:
     """Which of the seeds trained side by side."""
     fallback: bool = False
     """Where the last checkpoint is damaged, take the one before."""
+    modules: cli.Modules = ()
+    """A module, by name or path, that registers environments, bonuses or methods of yours."""
 
 
 def main(argv: Sequence[str]) -> None:
     """Parses and checks, and only then loads jax and MuJoCo."""
+    cli.import_modules(argv, draws=True)
     arguments = cli.parse(Arguments, argv, "render")
     config = files.read_config(arguments.directory)
+    config.check_registered()
     _check(arguments, config.archive_size)
     headless.check_drawable(config.env)
     video.check()
@@ -126,7 +130,7 @@ def _film(arguments: Arguments) -> None:
 
 
 def _seconds_in_an_episode(run: "Run") -> float:
-    return run.config.episode_length * float(run.components.env.dt)
+    return run.config.environment.episode_length * float(run.components.env.dt)
 
 
 class _Studio:

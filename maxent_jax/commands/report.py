@@ -44,13 +44,18 @@ class Arguments:
     """Of the rollouts; training evaluates with 0."""
     fallback: bool = False
     """Where a run's last checkpoint is damaged, take the one before."""
+    modules: cli.Modules = ()
+    """A module, by name or path, that registers environments, bonuses or methods of yours."""
 
 
 def main(argv: Sequence[str]) -> None:
     """Parses and checks, and only then loads jax."""
+    cli.import_modules(argv)
     arguments = cli.parse(Arguments, argv, "report")
     configs = [files.read_config(directory) for directory in arguments.directories]
     path = _check(arguments)
+    for config in configs:
+        config.check_registered()
     for directory in arguments.directories:
         integrity.check_any(directory)
     headless.draw_nothing()
@@ -123,7 +128,7 @@ def _run_section(name: str, seeds: Sequence["Run"]) -> dict[str, Any]:
     return {
         "name": name,
         "config": config,
-        "settings": dataclasses.asdict(config),
+        "settings": config.flat(),
         "headline": tables.headline(seeds),
         "departures": tables.departures(config),
         "budget": tables.budget(seeds[0], content.get("budget")),

@@ -26,6 +26,12 @@ if TYPE_CHECKING:
     from maxent_jax.runs.driver import Options
 from maxent_jax.visual import headless
 
+# What matters first: --help shows these, and --help-all the rest.
+SHOWN = (
+    *("env", "method", "preset", "backend", "seed", "num_seeds", "out", "resume"),
+    *("num_iterations", "steps_per_iteration", "updates_per_step", "num_envs"),
+)
+
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
@@ -35,8 +41,7 @@ class Arguments:
     out: Path | None = None
     """The run's directory; runs/ENV-METHOD-PRESET-SEED when left out."""
     resume: bool = False
-    """Go on from the last checkpoint in the run's directory; start over without one. With none of
-    --preset, --env and --method the settings are those of the run."""
+    """Continue from the last checkpoint in --out, with that run's settings; begin without one."""
     fallback: bool = False
     """With --resume: where the last checkpoint is damaged, remove it and take the one before."""
     overwrite: bool = False
@@ -58,6 +63,8 @@ class Arguments:
     """Processes of the run, with --coordinator HOST:PORT."""
     process_id: int = 0
     """Which of them this is, from 0."""
+    modules: cli.Modules = ()
+    """A module, by name or path, that registers environments, bonuses or methods of yours."""
 
     @property
     def directory(self) -> Path:
@@ -74,8 +81,10 @@ def read_arguments(argv: Sequence[str]) -> Arguments:
     """
     if cli.flag_value(argv, "--out") == "":
         raise errors.UsageError("out is empty: name a directory, or leave --out away.")
+    cli.import_modules(argv)
     default = Arguments(_default_config(argv))
-    arguments = cli.parse(Arguments, argv, "train", default=default)
+    arguments = cli.parse(Arguments, argv, "train", default=default, shown=SHOWN)
+    arguments.config.check_registered()
     _check_saving(arguments)
     _check_hosts(arguments)
     Sinks(arguments.tensorboard, arguments.wandb).check()
@@ -125,6 +134,7 @@ def check_free(arguments: Arguments) -> None:
         raise errors.UsageError(f"cannot write to {directory}: {error.strerror}.") from None
     if arguments.resume:
         files.check_config(directory, arguments.config)
+        files.check_resumable(directory)
     elif not arguments.overwrite:
         raise errors.UsageError(
             f"{directory} already exists: choose another --out, or add --resume to go on with it "

@@ -1,35 +1,27 @@
-"""Every setting of a run, and the checks of their values. Loads no array library."""
+"""Every setting of a run, in groups. Loads no array library."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Mapping
 from typing import Any
 
-from maxent_jax import checks, errors
-from maxent_jax.config import names, presets
-from maxent_jax.config.names import BY_METHOD, CLASSIC_ENVS, CORRECTIVE, MUJOCO_ENVS
-from maxent_jax.errors import ConfigError
+from maxent_jax.checks import check_choice
+from maxent_jax.config import paper, presets, registry, validation
+from maxent_jax.config.registry import BY_METHOD, CORRECTIVE
+from maxent_jax.errors import ConfigError, ConfigTypeError
+
+
+class _Checked:
+    """A group whose values are of the types that its fields say."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            value = validation.of_type(field.name, getattr(self, field.name), field.type)
+            object.__setattr__(self, field.name, value)
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
-    """Settings of a run; frozen and hashable, changed with `dataclasses.replace`."""
-
-    env: str = "ant"
-    """Environment: ant, walker2d, humanoid, pendulum, mountain_car, brax:NAME, or user:NAME for one
-    that maxent_jax.envs.register was told of."""
-    method: str = "v"
-    """h (Hazan 2019), la (Liu & Abbeel 2021) or v (Veritas), as the paper reads them; h-official or
-    apt, the first two as their authors published them; or a baseline by the name of its bonus."""
-    preset: str = "quick"
-    """The values that the other flags start from: smoke, quick, gpu or paper."""
-    backend: str = "auto"
-    """Physics: mjx, mujoco (C MuJoCo), warp (MuJoCo Warp), or auto: mujoco on a CPU, else mjx."""
-    physics: str = "reference"
-    """reference (the options of Gymnasium's XML) or fast (cheaper ones, see the README)."""
-    seed: int = 0
-    """Of everything random but the feature projection."""
-    num_seeds: int = 1
-    """Runs trained side by side by vmap: seed, seed + 1, ..."""
+class Budget(_Checked):
+    """How much is trained, and in what portions."""
 
     num_iterations: int = 6
     """T: policies trained after the initial one."""
@@ -41,14 +33,21 @@ class Config:
     """N: environments stepped together."""
     num_segments: int = 15
     """Parts of an iteration; progress is shown after each."""
-    snapshots: int = 1
-    """Policies that an iteration archives, evenly over its segments, the last at its end."""
     plateau_segments: int = 0
     """End an iteration before its budget is spent once its reward has stopped rising, judged by
     means over so many segments; 0: never."""
     plateau_tolerance: float = 0.05
     """What still counts as rising: a share of all that the reward rose in the iteration."""
 
+
+@dataclasses.dataclass(frozen=True)
+class Environment(_Checked):
+    """The episodes that states come from."""
+
+    backend: str = "auto"
+    """Physics: mjx, mujoco (C MuJoCo), warp (MuJoCo Warp), or auto: mujoco on a CPU, else mjx."""
+    physics: str = "reference"
+    """reference (the options of Gymnasium's XML) or fast (cheaper ones, see the README)."""
     episode_length: int = 1000
     """Time limit, control steps."""
     num_starts: int = 4096
@@ -59,10 +58,11 @@ class Config:
     """End an episode upside down; departs from the paper."""
     end_unhealthy: bool = True
     """End an episode where the robot's health fails."""
-    policy_inputs: str = "state"
-    """What the networks see: state, or heading (the same in the agent's own horizontal frame)."""
-    yaw_copies: int = 0
-    """Copies of each episode, turned by a random yaw, that the learner draws like the others."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Intrinsic(_Checked):
+    """The intrinsic reward that SAC is paid, in place of a reward from the environment."""
 
     reward: str = "log1p"
     """log1p: log(1 + R/c); linear: R/c; log: log(R/c); paper: p log R."""
@@ -70,6 +70,8 @@ class Config:
     """c, in feature units (metres for the first two features)."""
     reward_scale: float = 1.0
     """Factor on the whole reward that SAC sees."""
+    num_neighbors: int = 3
+    """k."""
     shaping: float = 0.0
     """Potential-based shaping: the potential, as a multiple of the reward's form. 0: none."""
     shaping_space: str = "features"
@@ -87,37 +89,51 @@ class Config:
     """What pays SAC in place of the distance to the reference: none, or a reward of
     maxent_jax/intrinsic: rnd, icm, ngu, re3, rise, renyi, vcse, kmeans, apt, histogram."""
 
-    num_neighbors: int = 3
-    """k."""
-    reference_size: int = 8192
-    """M: states that define the reward."""
-    mixture_episodes: int = 32
-    """Episodes rolled out with the mixture for each refresh, and again for each evaluation."""
-    mixing: str = "episode"
-    """A policy of the mixture is drawn for each episode, or for each step."""
-    pooled: bool = False
-    """Draw the reference from the pooled states of the mixture, so that long-lived policies weigh
-    more, instead of giving each policy its weight."""
-    leave_own_out: bool = True
-    """Score an archived policy without its own states in the reference."""
-    deterministic: bool = False
-    """The mixture's policies act by their mean where they are evaluated."""
+
+@dataclasses.dataclass(frozen=True)
+class Mixture(_Checked):
+    """The archive of policies, and the reference: the states that define the reward."""
+
+    snapshots: int = 1
+    """Policies that an iteration archives, evenly over its segments, the last at its end."""
     weights: str = "method"
     """Of the mixture: uniform, geometric, last (the newest policy alone), fully_corrective (the
     largest entropy that the archived policies can mix to, on the grid of the coverage), or as the
     method says."""
     eta: float = 0.1
     """η of the geometric weights."""
+    mixing: str = "episode"
+    """A policy of the mixture is drawn for each episode, or for each step."""
+    pooled: bool = False
+    """Draw the reference from the pooled states of the mixture, so that long-lived policies weigh
+    more, instead of giving each policy its weight."""
     reference: str = "method"
     """What the reward is measured against: mixture (its rollouts), history (a uniform sample of
     all states visited in training and, before there were any, in the first rollouts), or as the
     method says."""
+    reference_size: int = 8192
+    """M: states that define the reward."""
     refresh_period: int = BY_METHOD
     """Steps of all envs between refreshes of the reward; 0: once an iteration; -1: as the method
     says. A mixture changes once an iteration, so that any period above 0 matters to history."""
+    mixture_episodes: int = 32
+    """Episodes rolled out with the mixture for each refresh, and again for each evaluation."""
     start: str = "method"
     """The agent that an iteration starts from: scratch, last, best, or as the method says."""
+    leave_own_out: bool = True
+    """Score an archived policy without its own states in the reference."""
 
+
+@dataclasses.dataclass(frozen=True)
+class Learner(_Checked):
+    """SAC: what its networks see, their size, and how they learn."""
+
+    policy_inputs: str = "state"
+    """What the networks see: state, or heading (the same in the agent's own horizontal frame)."""
+    yaw_copies: int = 0
+    """Copies of each episode, turned by a random yaw, that the learner draws like the others."""
+    normalize_inputs: bool = False
+    """Networks see their inputs less the running mean of training, over its deviation."""
     hidden_layers: int = 2
     """Hidden layers of actor and critics."""
     hidden_size: int = 256
@@ -146,42 +162,89 @@ class Config:
     lagrangian_entropy: bool = False
     """Count the policy's entropy from its target in the soft return, so that at its target a policy
     neither gains nor loses by living."""
-    normalize_inputs: bool = False
-    """Networks see their inputs less the running mean of training, over its deviation."""
+    restart_temperature: bool = False
+    """Put α back to its initial value at the start of each iteration."""
     actor_average: float = 0.0
     """Rate at which an average follows the actor, update by update; the average is archived. 0: the
     actor itself is."""
-    restart_temperature: bool = False
-    """Put α back to its initial value at the start of each iteration."""
 
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation(_Checked):
+    """What is measured beside training."""
+
+    deterministic: bool = False
+    """The mixture's policies act by their mean where they are evaluated."""
     random_baseline: bool = True
     """Step a uniformly random policy beside the agent, for as many env steps, and log it."""
 
-    def __post_init__(self):
-        for field in dataclasses.fields(self):
-            value = _of_type(field.name, getattr(self, field.name), field.type)
-            object.__setattr__(self, field.name, value)
-        _check(self)
+
+@dataclasses.dataclass(frozen=True)
+class Config(_Checked):
+    """Settings of a run."""
+
+    env: str = "ant"
+    """ant, walker2d, humanoid, pendulum, mountain_car, brax:NAME, or user:NAME (see --import)."""
+    method: str = "v"
+    """h (Hazan 2019), la (Liu & Abbeel 2021), v (Veritas), h-official, or a bonus as a baseline."""
+    preset: str = "quick"
+    """The values that the other flags start from: smoke, quick, gpu or paper."""
+    seed: int = 0
+    """Of everything random but the feature projection."""
+    num_seeds: int = 1
+    """Seeds trained side by side by vmap: seed, seed + 1, ..."""
+
+    budget: Budget = Budget()
+    environment: Environment = Environment()
+    intrinsic: Intrinsic = Intrinsic()
+    mixture: Mixture = Mixture()
+    learner: Learner = Learner()
+    evaluation: Evaluation = Evaluation()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        validation.check(self.env, self.method, self.flat())
 
     @property
     def vector_steps(self) -> int:
         """Steps of all envs in a segment."""
-        return self.steps_per_iteration // (self.num_envs * self.num_segments)
+        budget = self.budget
+        return budget.steps_per_iteration // (budget.num_envs * budget.num_segments)
 
     @property
     def updates_per_vector_step(self) -> int:
         """Gradient steps after each step of all envs."""
-        return round(self.updates_per_step * self.num_envs)
+        return round(self.budget.updates_per_step * self.budget.num_envs)
 
     @property
     def archive_size(self) -> int:
         """P: the initial policy and those that each iteration archives."""
-        return 1 + self.num_iterations * self.snapshots
+        return 1 + self.budget.num_iterations * self.mixture.snapshots
 
     @property
     def simulates_in_jax(self) -> bool:
         """Whether MJX or brax computes the physics, for all that is known before jax is loaded."""
-        return self.backend == "mjx" or self.env.startswith("brax:")
+        return self.environment.backend == "mjx" or self.env.startswith("brax:")
+
+    def flat(self) -> dict[str, Any]:
+        """Every setting by its name, without its group. No two groups share a name."""
+        return {name: self[name] for name in DEFAULTS}
+
+    def __getitem__(self, name: str) -> Any:
+        return getattr(getattr(self, GROUPS[name]) if name in GROUPS else self, name)
+
+    def replace(self, **changes: Any) -> "Config":
+        """This config with some settings changed, each by its name, whatever its group.
+
+        Raises:
+          ConfigTypeError: no such setting, or a value of the wrong type.
+          ConfigError: a value that no run can have.
+        """
+        return from_flat({**self.flat(), **changes})
+
+    def check_registered(self) -> None:
+        """Raises ConfigError where a user's environment, method or bonus is not registered."""
+        registry.check_registered(self.env, self.method, self.intrinsic.bonus)
 
     def program(self) -> "Config":
         """This config with all that is data, not program, at its default.
@@ -189,276 +252,77 @@ class Config:
         Configs with equal programs share one compilation; the data enters the state in
         `algorithm.init`.
         """
-        defaults: dict[str, Any] = {name: DEFAULTS[name] for name in DATA_FIELDS}
-        if self.weights == CORRECTIVE:  # a computation, not a table
+        defaults = {name: DEFAULTS[name] for name in DATA_FIELDS}
+        if self.mixture.weights == CORRECTIVE:  # a computation, not a table
             del defaults["weights"]
-        return dataclasses.replace(self, **defaults)
+        return self.replace(**defaults)
 
     def deviations(self) -> dict[str, str]:
-        """What this config does otherwise than the paper, by field."""
-        paper = presets.PAPER | {"episode_length": _time_limit(self.env)}
-        named = {name: why for name, (value, why) in paper.items() if getattr(self, name) != value}
-        if self.shaping > 0 and self.shaping_space == "position":
-            named["shaping_space"] = "the potential is measured in position alone"
-        if self.reward != "paper":
-            named["reward_distance"] = "the scale c of the reward's form"
-        if self.episodic_weight == 0:
-            named["episodic_weight"] = "no episodic term"
-        for name in ("weights", "reference", "start", "refresh_period"):
-            if getattr(self, name) != DEFAULTS[name]:
-                named[name] = "set apart from its method"
-        return named
+        """What this config does otherwise than the paper: by setting, in words."""
+        return paper.deviations(self.env, self.flat(), DEFAULTS)
 
 
+GROUPS = {
+    setting.name: group.name
+    for group in dataclasses.fields(Config)
+    if dataclasses.is_dataclass(group.type)
+    for setting in dataclasses.fields(group.type)
+}
+"""The group of each setting that has one."""
+DEFAULTS: dict[str, Any] = {
+    field.name: field.default
+    for group in (Config, *(f.type for f in dataclasses.fields(Config)))
+    if dataclasses.is_dataclass(group)
+    for field in dataclasses.fields(group)
+    if not dataclasses.is_dataclass(field.type)
+}
+"""The value of each setting in `Config()`."""
 DATA_FIELDS = (
     *("method", "preset", "seed", "num_seeds"),
     *("weights", "eta", "reference", "refresh_period", "start"),
     *("plateau_segments", "plateau_tolerance"),
 )
-DEFAULTS = {field.name: field.default for field in dataclasses.fields(Config)}
+
+
+def from_flat(settings: Mapping[str, Any]) -> Config:
+    """The config with these settings, each by its name, and all others at their defaults.
+
+    Raises:
+      ConfigTypeError: no such setting, or a value of the wrong type.
+      ConfigError: a value that no run can have.
+    """
+    _check_settings(settings)
+    own: dict[str, Any] = {name: x for name, x in settings.items() if name not in GROUPS}
+    for group in dataclasses.fields(Config):
+        if dataclasses.is_dataclass(group.type):
+            given = {n: x for n, x in settings.items() if GROUPS.get(n) == group.name}
+            own[group.name] = group.type(**given)  # type: ignore[operator]
+    return Config(**own)
 
 
 def preset(name: str, **changes: Any) -> Config:
     """The config of that preset, in its environment and for its method, with changes.
 
+    Args:
+      name: smoke, quick, gpu or paper.
+      **changes: settings by name, whatever their group.
     Raises:
       ConfigError: an unknown preset or setting, or a value that no run can have.
     """
-    checks.check_choice("preset", name, presets.PRESETS)
-    for change in changes:
-        try:
-            checks.check_choice("setting", change, DEFAULTS)
-        except ConfigError as error:
-            raise errors.ConfigTypeError(str(error)) from None
+    check_choice("preset", name, presets.PRESETS)
+    _check_settings(changes)
     env, method = changes.get("env", Config.env), changes.get("method", Config.method)
-    names.check_env(env)
-    checks.check_choice("method", method, names.METHODS)
+    registry.environment(env)
     in_env = presets.IN_ENV.get((name, env), {})
-    of_method = presets.OF_METHOD.get(method, {})
+    of_method = registry.method(method).settings
     of_both = presets.OF_METHOD_IN_ENV.get((name, env, method), {})
-    settings = presets.PRESETS[name] | in_env | of_method | of_both
-    return Config(**{"preset": name, **settings, **changes})
+    settings = {**presets.PRESETS[name], **in_env, **of_method, **of_both}
+    return from_flat({"preset": name, **settings, **changes})
 
 
-def _time_limit(env: str) -> tuple[int, str]:
-    steps = 200 if env in CLASSIC_ENVS else 1000
-    return steps, f"the time limit is not {steps} steps"
-
-
-_CHOICES = {
-    "method": names.METHODS,
-    "bonus": ("none", *names.BONUSES),
-    "mixing": names.MIXINGS,
-    "preset": presets.PRESETS,
-    "reward": names.REWARDS,
-    "policy_inputs": names.INPUTS,
-    "shaping_space": names.SPACES,
-    "replay_dtype": names.REPLAY_DTYPES,
-    "weights": names.WEIGHTS,
-    "reference": names.REFERENCES,
-    "start": names.STARTS,
-}
-_AT_LEAST_ONE = (
-    *("num_seeds", "num_iterations", "steps_per_iteration", "num_envs", "num_segments"),
-    "snapshots",
-    *("episode_length", "num_starts", "num_neighbors", "reference_size", "mixture_episodes"),
-    *("hidden_layers", "hidden_size", "batch_size", "replay_size", "return_steps"),
-)
-# Each is a loop that is written out in the program, which grows with it.
-_UNROLLED = {"hidden_layers": 64, "num_neighbors": 256, "return_steps": 256}
-MOST = 2**31 - 1  # rows and steps are counted in 32 bits
-_POSITIVE = (
-    *("updates_per_step", "torque_limit", "reward_distance", "reward_scale", "learning_rate"),
-    *("soft_update_rate", "initial_temperature", "eta"),
-)
-_AT_MOST_ONE = ("torque_limit", "discount", "soft_update_rate", "eta", "actor_average")
-_NOT_NEGATIVE = (
-    *("seed", "plateau_segments", "plateau_tolerance", "shaping", "episodic_weight"),
-    *("alive_bonus", "actor_average"),
-    *("yaw_copies", "discount", "target_entropy_scale"),
-)
-
-
-_TYPES: dict[Any, tuple[Callable[[str, Any], Any], str]] = {
-    int: (checks.check_whole, "a whole number"),
-    float: (checks.check_number, "a number"),
-}
-
-
-def _of_type(name: str, value: Any, kind: Any) -> Any:
-    """The value as that type of Python's, also where it is numpy's or jax's.
-
-    Raises:
-      ConfigTypeError: it is no such value.
-    """
-    flag = name.replace("_", "-")
-    if kind in _TYPES:
-        convert, what = _TYPES[kind]
+def _check_settings(settings: Mapping[str, Any]) -> None:
+    for name in settings:
         try:
-            return convert(flag, value)
-        except TypeError:
-            raise errors.ConfigTypeError(f"{flag} is {value!r}, but must be {what}.") from None
-    if kind is bool and str(getattr(value, "dtype", "")) == "bool":
-        return bool(value)
-    if not isinstance(value, kind):
-        what = "True or False" if kind is bool else "a string"
-        raise errors.ConfigTypeError(f"{flag} is {value!r}, but must be {what}.")
-    return value
-
-
-def _check(config: Config) -> None:
-    names.check_env(config.env)
-    names.check_physics(config.env, config.backend, config.physics)
-    for name, known in _CHOICES.items():
-        checks.check_choice(name.replace("_", "-"), getattr(config, name), known)
-    bounds = (
-        (_AT_LEAST_ONE, lambda x: x >= 1, "at least 1"),
-        (_POSITIVE, lambda x: 0 < x < float("inf"), "a positive number"),
-        (_AT_MOST_ONE, lambda x: x <= 1, "at most 1"),
-        (_NOT_NEGATIVE, lambda x: 0 <= x < float("inf"), "0 or more"),
-        (("refresh_period",), lambda x: x >= BY_METHOD, "-1, 0 or more"),
-    )
-    for bounded, holds, requirement in bounds:
-        for name in bounded:
-            if not holds(getattr(config, name)):
-                flag = name.replace("_", "-")
-                raise ConfigError(f"{flag} is {getattr(config, name)}, but must be {requirement}.")
-    for name in (*_AT_LEAST_ONE, "yaw_copies", "refresh_period"):
-        most = _UNROLLED.get(name, MOST)
-        if getattr(config, name) > most:
-            raise ConfigError(
-                f"{name.replace('_', '-')} is {getattr(config, name)}, but must be at most {most}."
-            )
-    _check_together(config)
-
-
-def _check_together(c: Config) -> None:
-    group = c.num_envs * c.num_segments
-    updates = c.updates_per_step * c.num_envs
-    for wrong, sentence in (
-        (
-            c.bonus != presets.OF_METHOD.get(c.method, {}).get("bonus", c.bonus),
-            f"method is {c.method}, but bonus is {c.bonus}: leave it to the method.",
-        ),
-        (
-            c.bonus != "none" and (c.return_steps > 1 or c.shaping > 0 or c.episodic_weight > 0),
-            f"bonus is {c.bonus}, which is paid by the step alone: return-steps must be 1, and "
-            f"shaping and episodic-weight 0.",
-        ),
-        (
-            c.bonus != "none" and c.plateau_segments,
-            f"plateau-segments is {c.plateau_segments}, but is judged by the distance to the "
-            f"reference, which bonus {c.bonus} does not pay.",
-        ),
-        (
-            c.mixing == "step" and (c.pooled or c.leave_own_out or c.weights == CORRECTIVE),
-            "mixing is step, where no state belongs to a policy: pooled, leave-own-out and fully "
-            "corrective weights need mixing episode.",
-        ),
-        (
-            c.mixing == "step" and c.start == "best",
-            "mixing is step, where no state belongs to a policy: none is the best to start from.",
-        ),
-        (
-            c.pooled and c.weights == CORRECTIVE,
-            "pooled draws policies by their weights, which fully corrective ones only get later.",
-        ),
-        (
-            c.torque_limit < 1 and c.env not in MUJOCO_ENVS,
-            f"torque-limit is {c.torque_limit}, but {c.env} has no torques to limit.",
-        ),
-        (
-            c.end_flipped and c.env not in names.TORSO_ENVS,
-            f"end-flipped is on, but {c.env} has no floating torso that could be upside down.",
-        ),
-        (
-            not c.end_unhealthy and c.env not in MUJOCO_ENVS,
-            f"end-unhealthy is off, but {c.env} has no health that could fail.",
-        ),
-        (
-            c.policy_inputs == "heading" and c.env not in names.TORSO_ENVS,
-            f"policy-inputs is heading, but {c.env} has no floating torso with a heading.",
-        ),
-        (
-            c.yaw_copies and c.env not in names.TORSO_ENVS,
-            f"yaw-copies is {c.yaw_copies}, but {c.env} cannot be turned about the vertical.",
-        ),
-        (
-            2 * c.plateau_segments > c.num_segments,
-            f"plateau-segments is {c.plateau_segments}, but must be at most half of num-segments = "
-            f"{c.num_segments}.",
-        ),
-        (
-            c.steps_per_iteration % group,
-            f"steps-per-iteration is {c.steps_per_iteration}, but must be a multiple of "
-            f"num-envs × num-segments = {group}.",
-        ),
-        (
-            updates < 0.5 or abs(updates - round(updates)) > 1e-6,
-            f"updates-per-step × num-envs is {updates:g}, but must be a whole number from 1 up.",
-        ),
-        (
-            c.seed + c.num_seeds > 2**31,
-            f"seed + num-seeds is {c.seed + c.num_seeds}, but must not exceed 2^31.",
-        ),
-        (
-            c.num_iterations * c.steps_per_iteration > MOST,
-            f"num-iterations × steps-per-iteration is {c.num_iterations * c.steps_per_iteration}, "
-            f"but must be at most {MOST}: steps are counted in 32 bits.",
-        ),
-        (
-            c.num_iterations * c.steps_per_iteration * c.updates_per_step > MOST,
-            f"num-iterations × steps-per-iteration × updates-per-step is "
-            f"{c.num_iterations * c.steps_per_iteration * c.updates_per_step:g}, but must be at "
-            f"most {MOST}: gradient steps are counted in 32 bits.",
-        ),
-        (
-            c.mixture_episodes * c.episode_length > MOST,
-            f"mixture-episodes × episode-length is {c.mixture_episodes * c.episode_length}, but "
-            f"must be at most {MOST}: states are counted in 32 bits.",
-        ),
-        (
-            c.num_neighbors >= c.reference_size,
-            f"num-neighbors is {c.num_neighbors}, but must be below reference-size = "
-            f"{c.reference_size}.",
-        ),
-        (
-            c.batch_size > c.replay_size,
-            f"batch-size is {c.batch_size}, but must not exceed replay-size = {c.replay_size}.",
-        ),
-        (
-            updates * c.batch_size <= names.NEIGHBORS.get(c.bonus, 0),
-            f"batch-size is {c.batch_size}, but bonus {c.bonus} needs more than "
-            f"{names.NEIGHBORS.get(c.bonus)} transitions in the {updates:g} batches of a step.",
-        ),
-        (
-            4 * c.num_envs > c.replay_size,
-            f"replay-size is {c.replay_size}, but must hold four steps of all envs, "
-            f"{4 * c.num_envs}.",
-        ),
-        (
-            c.yaw_copies and c.replay_dtype != "float32",
-            f"replay-dtype is {c.replay_dtype}, but yaw copies need states in float32.",
-        ),
-        (
-            c.num_segments % c.snapshots > 0,
-            f"snapshots is {c.snapshots}, but must divide num-segments, {c.num_segments}.",
-        ),
-        (
-            c.snapshots > 1 and c.plateau_segments > 0,
-            f"snapshots is {c.snapshots}, but must be 1 with plateau-segments above 0: "
-            "an iteration that may end at a plateau archives one policy.",
-        ),
-        (
-            c.mixture_episodes < c.archive_size,
-            f"mixture-episodes is {c.mixture_episodes}, but each of the {c.archive_size} policies "
-            f"of the mixture needs one.",
-        ),
-        (
-            c.reference_size > c.mixture_episodes * c.episode_length,
-            f"reference-size is {c.reference_size}, but mixture-episodes × episode-length gives at "
-            f"most {c.mixture_episodes * c.episode_length} states.",
-        ),
-    ):
-        if wrong:
-            raise ConfigError(sentence)
+            check_choice("setting", name, DEFAULTS)
+        except ConfigError as error:
+            raise ConfigTypeError(str(error)) from None

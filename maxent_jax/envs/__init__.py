@@ -10,7 +10,7 @@ import io
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -21,37 +21,22 @@ from brax import envs as brax_envs
 from brax.envs.base import Env
 
 from maxent_jax.checks import check_number, check_path, check_whole
-from maxent_jax.config.names import check_env, check_physics
+from maxent_jax.config import registry
+from maxent_jax.config.registry import MUJOCO_ENVS, EnvironmentRow, resolve
+from maxent_jax.config.validation import check_physics
 from maxent_jax.density.histogram import Grid
-from maxent_jax.envs import ant, humanoid, mountain_car, pendulum, walker2d
+from maxent_jax.envs.entries import Entry
 from maxent_jax.envs.physics import REFERENCE, Options, PhysicsState
 from maxent_jax.envs.task import MujocoEnv, Task, uniform_reset
-from maxent_jax.envs.torso import Torso
 from maxent_jax.errors import ConfigError, ConfigTypeError
 from maxent_jax.types import Features
 
-TASKS = {task.name: task for task in (ant.TASK, walker2d.TASK, humanoid.TASK)}
-CLASSIC = {
-    "pendulum": (pendulum.Pendulum, pendulum.GRID),
-    "mountain_car": (mountain_car.MountainCar, mountain_car.GRID),
-}
+TASKS: dict[str, Task] = {name: resolve(f"maxent_jax.envs.{name}:TASK") for name in MUJOCO_ENVS}
 DEVIATIONS = ("torque_limit", "end_flipped", "end_unhealthy")  # of MujocoEnv
 BRAX_HIDES_POSITION = ("ant", "halfcheetah", "hopper", "humanoid", "swimmer", "walker2d")
 DEFAULT_GRID = Grid(
     names=("state 0", "state 1"), low=(-10.0, -10.0), high=(10.0, 10.0), bins=(100, 100)
 )
-
-
-class Entry(NamedTuple):
-    """How an environment is made, and what is known of it beside."""
-
-    make: Callable[..., Env]  # backend, physics, **deviations -> Env
-    grid: Grid  # where coverage and histogram entropy are measured
-    torso: Torso | None = None
-    phi: Features | None = None  # its feature map; None: see features.make_feature_map
-
-
-_registered: dict[str, Entry] = {}
 
 
 def make(name: str, backend: str = "auto", physics: str = "reference", **deviations: Any) -> Env:
@@ -69,7 +54,7 @@ def make(name: str, backend: str = "auto", physics: str = "reference", **deviati
     """
     found = entry(name)
     check_physics(name, backend, physics)
-    known = DEVIATIONS if name in TASKS else ()
+    known = DEVIATIONS if registry.environment(name).is_robot else ()
     for deviation in deviations:
         if deviation not in known:
             raise ConfigTypeError(
@@ -84,21 +69,12 @@ def entry(name: str) -> Entry:
     Raises:
       ConfigError: an unknown name.
     """
-    check_env(name)
-    kind, _, rest = name.rpartition(":")
-    if kind == "brax":
-        return Entry(functools.partial(_make_brax, rest), DEFAULT_GRID)
-    if kind == "user":
-        if name not in _registered:
-            raise ConfigError(
-                f"environment '{name}' is not registered: call maxent_jax.envs.register first."
-            )
-        return _registered[name]
-    if name in TASKS:
-        task = TASKS[name]
-        return Entry(functools.partial(MujocoEnv, task), task.grid, task.torso)
-    make_classic, grid = CLASSIC[name]
-    return Entry(functools.partial(_make_classic, make_classic), grid)
+    row = registry.environment(name)
+    if name.startswith("brax:"):
+        return Entry(functools.partial(_make_brax, name.removeprefix("brax:")), DEFAULT_GRID)
+    if row.entry is None:
+        raise registry.not_registered("environment", name)
+    return resolve(row.entry)
 
 
 def register(
@@ -118,11 +94,8 @@ def register(
     Raises:
       ConfigTypeError (a ValueError and a TypeError): an argument that is no such thing.
     """
+    registry.check_name("environment", name)
     for wrong, sentence in (
-        (
-            not isinstance(name, str) or not name,
-            f"the environment's name is {name!r}, but must be a string that is not empty.",
-        ),
         (not callable(make), f"make is {make!r}, but must be a function that makes a brax Env."),
         (not isinstance(grid, Grid), f"grid is {grid!r}, but must be a density.histogram.Grid."),
         (
@@ -132,7 +105,10 @@ def register(
     ):
         if wrong:
             raise ConfigTypeError(sentence)
-    _registered[f"user:{name}"] = Entry(make, grid, None, phi)
+    row = EnvironmentRow(
+        Entry(make, grid, None, phi), backends=registry.BACKENDS, physics=registry.PHYSICS
+    )
+    registry.register_environment(name, row)
 
 
 def from_xml(
@@ -177,10 +153,6 @@ def _qpos_and_qvel(state: PhysicsState, _) -> Any:
 
 def _finite(observation: Any) -> Any:
     return jnp.isfinite(observation).all(-1)
-
-
-def _make_classic(kind: Callable[[], Env], _backend: str, _physics: str) -> Env:
-    return kind()
 
 
 def _make_brax(name: str, backend: str, _physics: str) -> Env:

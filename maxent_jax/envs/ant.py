@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from maxent_jax.density.histogram import Grid
-from maxent_jax.envs import physics, torso
+from maxent_jax.envs import entries, physics, torso
 from maxent_jax.envs.physics import Derived, Options, PhysicsState
 from maxent_jax.envs.task import Task
 
@@ -57,3 +57,4 @@ TASK = Task(
     fast=Options("Euler", substeps=2, iterations=4, ls_iterations=8, max_contacts=6),
     torso=torso.make(num_positions=15, num_velocities=14),
 )
+ENTRY = entries.of_task(TASK)

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 
 from maxent_jax.density.histogram import Grid
-from maxent_jax.envs import physics, task, torso
+from maxent_jax.envs import entries, physics, task, torso
 from maxent_jax.envs.physics import Derived, Options, PhysicsState
 from maxent_jax.envs.task import Task
 
@@ -96,3 +96,4 @@ TASK = Task(
     fast=Options("Euler", iterations=4, ls_iterations=8, max_contacts=8),
     torso=torso.make(24, NUM_VELOCITIES, rotate_derived),
 )
+ENTRY = entries.of_task(TASK)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from brax.envs.base import Env, State
 
 from maxent_jax.density.histogram import Grid
+from maxent_jax.envs import entries
 from maxent_jax.envs.task import check_action
 from maxent_jax.precision import in_32_bits
 
@@ -73,3 +74,6 @@ class MountainCar(Env):
     def backend(self) -> str:
         """What simulates."""
         return "jax"
+
+
+ENTRY = entries.of_class(MountainCar, GRID)

@@ -10,7 +10,7 @@ import mujoco
 from brax.envs.base import Env, State
 
 from maxent_jax.checks import check_choice, check_number
-from maxent_jax.config.names import BACKENDS, PHYSICS
+from maxent_jax.config.registry import BACKENDS, PHYSICS
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import mjx_backend, mujoco_backend, physics
 from maxent_jax.envs.physics import Derived, Options, PhysicsState

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from maxent_jax.density.histogram import Grid
-from maxent_jax.envs import physics, task
+from maxent_jax.envs import entries, physics, task
 from maxent_jax.envs.physics import Derived, Options, PhysicsState
 from maxent_jax.envs.task import Task
 
@@ -52,3 +52,4 @@ TASK = Task(
     ),
     fast=Options("Euler", iterations=4, ls_iterations=8, max_contacts=4),
 )
+ENTRY = entries.of_task(TASK)

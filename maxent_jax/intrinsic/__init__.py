@@ -4,24 +4,27 @@ from collections.abc import Callable
 
 import jax
 
-from maxent_jax.intrinsic import apt, histogram, icm, kmeans, ngu, re3, rise, rnd, vcse
+from maxent_jax.config import registry
+from maxent_jax.config.registry import BonusRow, resolve
+from maxent_jax.errors import ConfigTypeError
 from maxent_jax.intrinsic.protocol import Bonus, Episodic, Setting, Steps
 
-__all__ = ["NAMES", "Bonus", "Episodic", "Setting", "Steps", "make"]
+__all__ = ["Bonus", "Episodic", "Setting", "Steps", "make", "register"]
 
-_MAKERS: dict[str, Callable[[Setting], Bonus]] = {
-    "rnd": rnd.make,
-    "icm": icm.make,
-    "ngu": ngu.make,
-    "re3": re3.make,
-    "rise": rise.make,
-    "renyi": rise.make_renyi,
-    "vcse": vcse.make,
-    "kmeans": kmeans.make,
-    "apt": apt.make,
-    "histogram": histogram.make,
-}
-NAMES = tuple(_MAKERS)
+
+def register(name: str, make: Callable[[Setting], Bonus], num_neighbors: int = 0) -> None:
+    """Makes a bonus of the user's known as `user:NAME`, and a method of that name which it pays.
+
+    Args:
+      make: the functions of the bonus, for what it is made from.
+      num_neighbors: k, where it compares the states of a batch, which must then hold more.
+    Raises:
+      ConfigTypeError (a ValueError and a TypeError): an argument that is no such thing.
+    """
+    registry.check_name("bonus", name)
+    if not callable(make):
+        raise ConfigTypeError(f"make is {make!r}, but must be a function that makes a Bonus.")
+    registry.register_bonus(name, BonusRow(make, num_neighbors))
 
 
 def make(
@@ -35,7 +38,7 @@ def make(
     """The bonus of that name.
 
     Args:
-      name: one of NAMES.
+      name: a row of config.registry.BONUSES.
       observation_size, action_size: D and A.
       scale: [D] positive, what counts as 1 of each observation: networks and distances see
         observation / scale.
@@ -44,8 +47,9 @@ def make(
     Raises:
       ValueError: an unknown name, or a scale that is not [D].
     """
-    if name not in _MAKERS:
-        raise ValueError(f"unknown bonus '{name}': choose one of {', '.join(NAMES)}")
+    row = registry.bonus(name)
     if scale.shape != (observation_size,):
         raise ValueError(f"scale has shape {scale.shape}, but must be ({observation_size},)")
-    return _MAKERS[name](Setting(observation_size, action_size, scale, learning_rate, num_cells))
+    return resolve(row.make)(
+        Setting(observation_size, action_size, scale, learning_rate, num_cells)
+    )

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from maxent_jax import moments
-from maxent_jax.config.names import NEIGHBORS
+from maxent_jax.config.registry import BONUSES
 from maxent_jax.intrinsic import icm, particles
 from maxent_jax.intrinsic.descent import Learned
 from maxent_jax.intrinsic.icm import Icm
@@ -22,7 +22,7 @@ from maxent_jax.intrinsic.protocol import Bonus, Setting, Steps
 from maxent_jax.moments import Moments
 from maxent_jax.types import Metrics
 
-NUM_NEIGHBORS = NEIGHBORS["apt"]  # knn_k of URLB
+NUM_NEIGHBORS = BONUSES["apt"].num_neighbors  # knn_k of URLB
 DISTANCE_CLIP = 1e-4  # knn_clip of URLB, in running means
 MEAN_FLOOR = 1e-8  # where all states met so far are one
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, cast
 import jax
 import jax.numpy as jnp
 
-from maxent_jax.config.names import NEIGHBORS
+from maxent_jax.config.registry import BONUSES
 from maxent_jax.intrinsic import particles, protocol
 from maxent_jax.intrinsic.protocol import (
     EMBEDDING_SIZE,
@@ -26,7 +26,7 @@ from maxent_jax.intrinsic.protocol import (
 )
 from maxent_jax.sac.networks import Mlp
 
-NUM_NEIGHBORS = NEIGHBORS["re3"]  # k of rad_re3/config.yaml
+NUM_NEIGHBORS = BONUSES["re3"].num_neighbors  # k of rad_re3/config.yaml
 
 
 class Re3(NamedTuple):

@@ -12,11 +12,11 @@ import functools
 import jax
 
 from maxent_jax import rewards
-from maxent_jax.config.names import NEIGHBORS
+from maxent_jax.config.registry import BONUSES
 from maxent_jax.intrinsic import particles, protocol
 from maxent_jax.intrinsic.protocol import Bonus, Setting, State, Steps
 
-NUM_NEIGHBORS, ORDER = NEIGHBORS["rise"], 0.1  # k and alpha of src/rise.py
+NUM_NEIGHBORS, ORDER = BONUSES["rise"].num_neighbors, 0.1  # k and alpha of src/rise.py
 
 
 def make(setting: Setting) -> Bonus:

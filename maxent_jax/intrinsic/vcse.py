@@ -16,12 +16,12 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.special import digamma
 
-from maxent_jax.config.names import NEIGHBORS
+from maxent_jax.config.registry import BONUSES
 from maxent_jax.density.knn import smallest_k
 from maxent_jax.intrinsic import particles, protocol
 from maxent_jax.intrinsic.protocol import Bonus, Setting, State, Steps
 
-NUM_NEIGHBORS = NEIGHBORS["vcse"]  # knn_k of VCSE_SAC/config/agent/sac.yaml
+NUM_NEIGHBORS = BONUSES["vcse"].num_neighbors  # knn_k of VCSE_SAC/config/agent/sac.yaml
 LOG_OFFSET = 1e-5  # of their code
 VARIANCE_FLOOR = 1e-5  # of the values: that of their layer norm
 ROUNDING = 1e-6

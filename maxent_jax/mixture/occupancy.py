@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from maxent_jax import mixture, rewards, rollout
 from maxent_jax.components import Components
-from maxent_jax.config.names import CORRECTIVE
+from maxent_jax.config.registry import CORRECTIVE
 from maxent_jax.density import entropy, histogram
 from maxent_jax.density.knn import NONE_EXCLUDED, knn_distances
 from maxent_jax.envs.base import State
@@ -60,12 +60,12 @@ def of_mixture(
     """
     key_assign, key_act = jax.random.split(key)
     num_episodes = starts.done.shape[0]
-    if components.config.mixing == "step":
+    if components.config.mixture.mixing == "step":
         act = _act_by_any(components, archive, weights, deterministic)
         reached = _play(components, act, starts, key_act)
         nobody = jnp.zeros(num_episodes, jnp.int32)
         return of_episodes(components, weights, nobody, *_visited(reached), alike=True)
-    if components.config.pooled:
+    if components.config.mixture.pooled:
         plays, offset = weights, jax.random.uniform(key_assign)
     else:
         slots = jnp.arange(weights.shape[0])
@@ -73,7 +73,7 @@ def of_mixture(
         plays, offset = chosen / jnp.sum(chosen), jnp.asarray(0.5)
     episode_policy = mixture.assign_episodes(plays, num_episodes, offset)
     reached = play(components, archive, episode_policy, starts, key_act, deterministic)
-    pooled = components.config.pooled
+    pooled = components.config.mixture.pooled
     return of_episodes(components, weights, episode_policy, *_visited(reached), alike=pooled)
 
 
@@ -85,7 +85,7 @@ def corrected(
     Args:
       weights: [P] with which the occupancy was made.
     """
-    if components.config.weights != CORRECTIVE:
+    if components.config.mixture.weights != CORRECTIVE:
         return occupancy, weights
 
     def cells_of(slot):
@@ -177,7 +177,9 @@ def _act_by_any(components: Components, archive: Archive, weights: jax.Array, de
 
 
 def _play(components, act, starts, key):
-    return rollout.episodes(components.env, starts, act, components.config.episode_length, key)
+    return rollout.episodes(
+        components.env, starts, act, components.config.environment.episode_length, key
+    )
 
 
 def _visited(reached: Trajectories) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -207,22 +209,24 @@ def score(
     num_rows = occupancy.policy.shape[0]
     capacity = jax.tree.leaves(archive.parameters)[0].shape[0]
     label = capacity + jnp.arange(num_rows, dtype=jnp.int32)  # by itself, or by its iteration
-    if config.leave_own_out:
-        iteration = (occupancy.policy + config.snapshots - 1) // config.snapshots
+    if config.mixture.leave_own_out:
+        iteration = (occupancy.policy + config.mixture.snapshots - 1) // config.mixture.snapshots
         owner = jnp.where(rows < 0, -1, iteration[rows])
         others = jnp.sum(owner[None] != jnp.arange(capacity)[:, None], axis=1)  # [P]
-        alone = others < config.num_neighbors
+        alone = others < config.intrinsic.num_neighbors
         label = jnp.where(alone[iteration], label, iteration)
     point_label = jnp.where(rows < 0, NONE_EXCLUDED - 1, label[rows])
     distance = knn_distances(
         occupancy.features,
         points,
-        config.num_neighbors,
+        config.intrinsic.num_neighbors,
         exclude=label,
         count=num_filled,
         labels=point_label,
     )[:, -1]
-    reward = rewards.of_distance(distance, config.reward, config.reward_distance, points.shape[1])
+    reward = rewards.of_distance(
+        distance, config.intrinsic.reward, config.intrinsic.reward_distance, points.shape[1]
+    )
     alive = occupancy.alive.astype(jnp.float32)
     total = jnp.zeros(capacity).at[occupancy.policy].add(jnp.where(alive > 0, reward, 0.0))
     lived = jnp.zeros(capacity).at[occupancy.policy].add(alive)
@@ -241,12 +245,14 @@ def measures(components: Components, occupancy: Occupancy, key: jax.Array) -> Me
     """Coverage and entropies of the mixture, on the environment's grid and in feature space."""
     config = components.config
     cells = histogram.count(occupancy.states, components.grid, occupancy.weight)
-    rows = mixture.draw_rows(occupancy.weight, config.reference_size, key)
+    rows = mixture.draw_rows(occupancy.weight, config.mixture.reference_size, key)
     sample = occupancy.features[rows]
     return {
         "mixture_coverage": histogram.coverage(cells),
         "mixture_entropy": histogram.shannon_entropy(cells),
         "mixture_off_grid_share": jnp.maximum(1 - jnp.sum(cells), 0.0),  # sums round
-        "mixture_knn_entropy": entropy.knn_entropy(sample, config.num_neighbors, labels=rows),
+        "mixture_knn_entropy": entropy.knn_entropy(
+            sample, config.intrinsic.num_neighbors, labels=rows
+        ),
         "evaluation_episode_length": jnp.sum(occupancy.alive) / occupancy.episode_policy.shape[0],
     }

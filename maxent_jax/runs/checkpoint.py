@@ -30,8 +30,10 @@ from maxent_jax.errors import CheckpointError, SaveError
 from maxent_jax.mixture import Archive
 from maxent_jax.runs import files, integrity
 from maxent_jax.runs.integrity import ARRAYS, FOLDER, UNFINISHED
+from maxent_jax.sac.agent import Parameters
 
 CHECKPOINTS_KEPT = 2
+WITH_MOMENTS = 5  # the schema since which an agent may have moments of its inputs
 # In a checkpoint's folder, beside its config.json and metrics.jsonl:
 PROGRESS, PARTIAL = "progress.json", "partial.npz"
 
@@ -129,8 +131,15 @@ def restore_results(run_directory: Path, name: str, config: Config) -> Results:
     Raises:
       CheckpointError: it does not hold results of this config.
     """
-    abstract = {"results": _items(_abstract(_shapes(config)))["results"]}
-    return _load(run_directory, name, abstract)["results"]
+    results: Results = _items(_abstract(_shapes(config)))["results"]
+    if files.read_schema(run_directory) >= WITH_MOMENTS:
+        return _load(run_directory, name, {"results": results})["results"]
+    less: Any = results.archive.parameters._asdict()
+    del less["moments"]
+    older = results._replace(archive=results.archive._replace(parameters=less))
+    found = _load(run_directory, name, {"results": older})["results"]
+    parameters = Parameters(**found.archive.parameters)
+    return found._replace(archive=found.archive._replace(parameters=parameters))
 
 
 def _write_progress(folder: Path, progress: Progress, machine: dict[str, Any]) -> None:

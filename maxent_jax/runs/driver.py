@@ -65,7 +65,7 @@ def train(
     placed = _placement(config, options.num_devices)
     hosts.first_alone(lambda: integrity.clear_unfinished(directory), "clear")
     progress = _last_progress(directory, options)
-    if progress is not None and len(progress.rows) == config.num_iterations:
+    if progress is not None and len(progress.rows) == config.budget.num_iterations:
         hosts.leave()
         if hosts.is_first():
             print(f"{directory} is complete: nothing to train.")
@@ -102,12 +102,17 @@ def _placement(config: Config, num_devices: int) -> State | None:
 def _fresh(config: Config, directory: Path, placed: State | None) -> Stage:
     def write() -> None:
         machine = {"backend": components.make(config).env.backend} | _machine()
-        files.write_config(directory, config, methods.row(config)._asdict(), machine)
+        files.write_config(directory, config, _method_in_words(config), machine)
         files.write_metrics(directory, [])
 
     hosts.first_alone(write, "config")
     state = algorithm.start(config) if placed is None else devices.start(config, placed)
     return Stage(state, Progress([], None, [], {}))
+
+
+def _method_in_words(config: Config) -> dict[str, Any]:
+    row = methods.row(config)
+    return {name: getattr(row, name) for name in row._fields if name != "settings"}
 
 
 def _last_progress(directory: Path, options: Options) -> Progress | None:
@@ -164,7 +169,7 @@ def _train(
         compiling_since = time.perf_counter()
         programs = algorithm.compiled(config, programs)
         clock.compiled(compiling_since)
-        while done < config.num_iterations:
+        while done < config.budget.num_iterations:
             state, progress = advance(config, programs, state, progress, clock, bar)
             check_finite(directory, state, progress)
             done = len(progress.rows)
@@ -176,7 +181,7 @@ def _train(
             due = (
                 time.perf_counter() - saved_at >= 60 * options.save_minutes
                 or (iteration_ended and done % options.save_iterations == 0)
-                or done == config.num_iterations
+                or done == config.budget.num_iterations
             )
             received, saves = hosts.largest(interruption.received or 0, int(due))
             if received or saves:
@@ -184,7 +189,7 @@ def _train(
                 timed = progress._replace(clock=clock.seconds())
                 checkpoint.save(directory, state, timed, _machine())
                 clock.saved(saved_at)
-            if received and done < config.num_iterations:
+            if received and done < config.budget.num_iterations:
                 raise Interrupted(received, directory)
     return progress.rows
 

@@ -12,10 +12,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from maxent_jax.config import Config
+from maxent_jax.config import DEFAULTS, Config, from_flat, registry
 from maxent_jax.errors import ConfigError, RunError, SaveError
 
-SCHEMA = 6  # of the directory, checkpoints included
+SCHEMA = 7  # of the directory, checkpoints included
+READABLE = (4, 5, 6, 7)  # whose policies and visits have the same arrays
+RESUMABLE = (6, 7)  # whose whole state has the same arrays
+REMOVED = {"restart_actor": False}  # settings of older schemas, with the value that is ours
 CONFIG, METRICS, FIGURES = "config.json", "metrics.jsonl", "figures"
 # All that any entry point writes there.
 WRITTEN = (
@@ -36,21 +39,21 @@ def write_config(
 ) -> None:
     """config.json: every setting, what departs from the paper, the stack and the machine."""
     departures = {
-        name: {"value": getattr(config, name), "why": why}
-        for name, why in config.deviations().items()
+        name: {"value": config[name], "why": why} for name, why in config.deviations().items()
     }
     content = {
         "schema": SCHEMA,
         "id": uuid.uuid4().hex[:12],
         "config": dataclasses.asdict(config),
         "method": method,
+        "imported": registry.imported,
         "deviations_from_the_paper": departures,
         "budget": {
-            "env_steps": config.steps_per_iteration * config.num_iterations,
+            "env_steps": config.budget.steps_per_iteration * config.budget.num_iterations,
             "gradient_steps": config.updates_per_vector_step
             * config.vector_steps
-            * config.num_segments
-            * config.num_iterations,
+            * config.budget.num_segments
+            * config.budget.num_iterations,
         },
         "versions": stack(),
         "machine": machine,
@@ -72,12 +75,36 @@ def read_config(directory: Path) -> Config:
         raise RunError(
             f"{directory} is not the directory of a run: no readable {CONFIG}."
         ) from None
-    if schema != SCHEMA:
-        raise RunError(f"{path} has schema {schema}, but this release reads schema {SCHEMA}.")
+    if schema not in READABLE:
+        raise RunError(
+            f"{path} has schema {schema}, but this release reads schemas {READABLE[0]} to {SCHEMA}."
+        )
     try:
-        return Config(**settings)
+        return from_flat(_ungrouped(settings))
     except (TypeError, ConfigError) as error:
         raise RunError(f"{path} does not fit this release: {error}") from None
+
+
+def _ungrouped(settings: dict[str, Any]) -> dict[str, Any]:
+    """Every setting by its name; schemas before 7 had no groups."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        flat |= value if isinstance(value, dict) else {name: value}
+    return {n: x for n, x in flat.items() if not (n in REMOVED and REMOVED[n] == x)}
+
+
+def check_resumable(directory: Path) -> None:
+    """Whether this release can go on with the training of the run.
+
+    Raises:
+      RunError: an older release made it, whose replay is stored otherwise.
+    """
+    schema = read_schema(directory)
+    if schema not in RESUMABLE:
+        raise RunError(
+            f"{directory} cannot be resumed: it has schema {schema}, and this release resumes "
+            f"schemas {RESUMABLE[0]} to {SCHEMA}. Its results can still be loaded."
+        )
 
 
 def is_config(path: Path) -> bool:
@@ -97,21 +124,29 @@ def check_config(directory: Path, config: Config) -> None:
     """
     saved = read_config(directory)
     # A preset is a name for values that are compared one by one.
-    names = [field.name for field in dataclasses.fields(Config) if field.name != "preset"]
-    values = ((name, getattr(saved, name), getattr(config, name)) for name in names)
+    values = ((name, saved[name], config[name]) for name in DEFAULTS if name != "preset")
     changed = [f"{name} was {old} and is {new}" for name, old, new in values if old != new]
     if changed:
         raise RunError(f"{directory} holds a run with other settings: {', '.join(changed)}.")
 
 
+def read_schema(directory: Path) -> int:
+    """Of a run's directory."""
+    return _read(directory)["schema"]
+
+
 def read_versions(directory: Path) -> dict[str, str]:
     """Of the stack that began the run."""
-    return json.loads((directory / CONFIG).read_text(encoding="utf-8"))["versions"]
+    return _read(directory)["versions"]
 
 
 def read_id(directory: Path) -> str:
     """Of the run, drawn when it began."""
-    return json.loads((directory / CONFIG).read_text(encoding="utf-8"))["id"]
+    return _read(directory)["id"]
+
+
+def _read(directory: Path) -> dict[str, Any]:
+    return json.loads((directory / CONFIG).read_text(encoding="utf-8"))
 
 
 def append_metrics(directory: Path, row: dict[str, Any]) -> None:

@@ -13,7 +13,7 @@ import jax
 
 from maxent_jax import algorithm, components
 from maxent_jax.config import Config
-from maxent_jax.config.settings import MOST
+from maxent_jax.config.validation import MOST
 from maxent_jax.errors import ConfigError
 from maxent_jax.runs import machine
 from maxent_jax.runs.machine import Room, readable
@@ -38,7 +38,7 @@ def check(config: Config, devices: Sequence[jax.Device]) -> None:
     setting = max(need, key=need.__getitem__)
     if config.num_seeds > 1 and total / config.num_seeds <= room.size:
         setting = "num-seeds"
-    value = getattr(config, setting.replace("-", "_"))
+    value = config[setting.replace("-", "_")]
     raise ConfigError(
         f"{setting} is {value}, with which the run needs at least {readable(total)} of memory, "
         f"but {room.of} has {readable(room.size)}: choose a smaller {setting}."
@@ -47,8 +47,8 @@ def check(config: Config, devices: Sequence[jax.Device]) -> None:
 
 def check_episodes(config: Config, num_episodes: int) -> None:
     """As `check_rows`, of the states of episodes."""
-    what = f"states ({num_episodes} episodes of {config.episode_length} steps)"
-    check_rows(config, num_episodes * config.episode_length, what)
+    what = f"states ({num_episodes} episodes of {config.environment.episode_length} steps)"
+    check_rows(config, num_episodes * config.environment.episode_length, what)
 
 
 def check_rows(config: Config, num_rows: int, what: str) -> None:
@@ -91,23 +91,27 @@ def of_a_seed(config: Config) -> dict[str, int]:
     policies, agent = nbytes(state.archive), nbytes(learner.agent)
     policy = policies // c.archive_size
     actor = nbytes(state.archive.parameters.actor) // c.archive_size
-    actors = c.mixture_episodes * actor if c.mixing == "episode" else 0
+    actors = c.mixture.mixture_episodes * actor if c.mixture.mixing == "episode" else 0
     large = policy >= LARGE_POLICY
     num_dims = components.make(config).num_seen
-    drawn = c.updates_per_vector_step * c.batch_size
-    visited = c.mixture_episodes * c.episode_length * _bytes_of_a_visit(c)
+    drawn = c.updates_per_vector_step * c.learner.batch_size
+    visited = c.mixture.mixture_episodes * c.environment.episode_length * _bytes_of_a_visit(c)
     begin_or_end = {
         "hidden-size": 2 * agent + (actors if large else 0),
         "mixture-episodes": visited + (0 if large else actors),
     }
-    batches = "num-envs" if c.updates_per_vector_step > c.batch_size else "batch-size"
-    layers = "batch-size" if c.batch_size > c.hidden_size else "hidden-size"
+    batches = "num-envs" if c.updates_per_vector_step > c.learner.batch_size else "batch-size"
+    layers = "batch-size" if c.learner.batch_size > c.learner.hidden_size else "hidden-size"
     step = {"num-envs": 0, "batch-size": 0, "hidden-size": agent}
     step[batches] += FLOAT * drawn * 2 * num_dims
-    step[layers] += FLOAT * c.batch_size * c.hidden_size * c.hidden_layers * 3
+    step[layers] += (
+        FLOAT * c.learner.batch_size * c.learner.hidden_size * c.learner.hidden_layers * 3
+    )
     beside = max(begin_or_end, step, key=lambda need: sum(need.values()))
     of_state = {
-        "replay-size" if c.yaw_copies < MANY_COPIES else "yaw-copies": nbytes(learner.replay),
+        "replay-size" if c.learner.yaw_copies < MANY_COPIES else "yaw-copies": nbytes(
+            learner.replay
+        ),
         "hidden-size": agent + (policies if large else 0),
         "num-iterations": nbytes(state.method) + (0 if large else policies),
         "num-envs": nbytes((learner.episodes.env, learner.place, learner.memory)),

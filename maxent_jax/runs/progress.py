@@ -38,11 +38,11 @@ def announce(config: Config, directory: Path, iterations_done: int) -> None:
     c = config
     last = c.seed + c.num_seeds - 1
     seeds = f"seed {c.seed}" if c.num_seeds == 1 else f"seeds {c.seed} to {last}"
-    env_steps = c.num_seeds * c.num_iterations * c.steps_per_iteration
+    env_steps = c.num_seeds * c.budget.num_iterations * c.budget.steps_per_iteration
     done = f", {iterations_done} of them done" if iterations_done else ""
     say(
-        f"{c.method} on {c.env}, preset {c.preset}, {seeds}: {c.num_iterations} iterations{done}, "
-        f"{env_steps:,} env steps, into {directory}\n"
+        f"{c.method} on {c.env}, preset {c.preset}, {seeds}: "
+        f"{c.budget.num_iterations} iterations{done}, {env_steps:,} env steps, into {directory}\n"
         f"compiling, about {COMPILING[c.simulates_in_jax]}, less where programs are cached; "
         f"Ctrl-C saves the run"
     )
@@ -86,8 +86,8 @@ class Bar:
         self._trained_here = 0  # segments, by this process
         self._task = self._progress.add_task(
             self._description(),
-            total=config.num_iterations * config.num_segments,
-            completed=iteration * config.num_segments + segments,
+            total=config.budget.num_iterations * config.budget.num_segments,
+            completed=iteration * config.budget.num_segments + segments,
             status=_together("compiling", *self._reached),
         )
 
@@ -102,7 +102,7 @@ class Bar:
     def segment_done(self) -> None:
         """After a segment."""
         c, now = self._config, time.perf_counter()
-        steps = c.num_seeds * c.vector_steps * c.num_envs
+        steps = c.num_seeds * c.vector_steps * c.budget.num_envs
         self._rate = [f"{steps / (now - self._last):,.0f} steps/s"]
         self._segments, self._trained_here = self._segments + 1, self._trained_here + 1
         self._last = now
@@ -117,13 +117,16 @@ class Bar:
         self._iteration, self._segments = self._iteration + 1, 0
         self._reached, self._last = _reached(row), time.perf_counter()
         self._show()
-        name = f"iteration {self._iteration}/{self._config.num_iterations}"
+        name = f"iteration {self._iteration}/{self._config.budget.num_iterations}"
         spent = f"{duration(row['wall_seconds'])}{self._left()}"
         self._line(_together(name, *self._spent(), *self._reached, spent))
 
     def _left(self) -> str:
         """An estimate, from all segments of this process but the first, which is compiled."""
-        left = self._config.num_iterations * self._config.num_segments - self._done_segments()
+        left = (
+            self._config.budget.num_iterations * self._config.budget.num_segments
+            - self._done_segments()
+        )
         if left == 0 or self._trained_here < 2:
             return ""
         rate = (self._last - self._compiled) / (self._trained_here - 1)
@@ -135,16 +138,16 @@ class Bar:
             say(sentence)
 
     def _description(self) -> str:
-        now = min(self._iteration + 1, self._config.num_iterations)
-        return f"iteration {now}/{self._config.num_iterations}"
+        now = min(self._iteration + 1, self._config.budget.num_iterations)
+        return f"iteration {now}/{self._config.budget.num_iterations}"
 
     def _done_segments(self) -> int:
-        return self._iteration * self._config.num_segments + self._segments
+        return self._iteration * self._config.budget.num_segments + self._segments
 
     def _spent(self) -> list[str]:
         c, vector_steps = self._config, self._done_segments() * self._config.vector_steps
         return [
-            f"{vector_steps * c.num_envs:,} env steps",
+            f"{vector_steps * c.budget.num_envs:,} env steps",
             f"{vector_steps * c.updates_per_vector_step:,} updates",
         ]
 

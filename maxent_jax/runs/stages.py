@@ -50,7 +50,7 @@ def _row(config: Config, progress: Progress, at_end: dict[str, np.ndarray]) -> d
     """The line of metrics.jsonl for an iteration, but for its times."""
     segments = progress.segments
     stacked = jax.tree.map(lambda *x: np.stack(x), *segments)
-    rewards = np.full((*stacked["step_reward"].shape[1:], config.num_segments), np.nan)
+    rewards = np.full((*stacked["step_reward"].shape[1:], config.budget.num_segments), np.nan)
     rewards[..., : len(segments)] = np.moveaxis(stacked["step_reward"], 0, -1)
     return {
         **at_end,
@@ -66,14 +66,16 @@ def _trained(config: Config, segments: list[dict[str, np.ndarray]]) -> bool:
     """Whether the iteration's budget is spent, or its reward has stopped rising."""
     if not segments:
         return False
-    return len(segments) == config.num_segments or _all_converged(config, segments)
+    return len(segments) == config.budget.num_segments or _all_converged(config, segments)
 
 
 def _all_converged(config: Config, segments: list[dict[str, np.ndarray]]) -> bool:
     """Of all seeds, which train in step."""
     rewards = np.stack([metrics["step_reward"] for metrics in segments], axis=-1)
     return all(
-        has_plateaued(list(of_seed), config.plateau_segments, config.plateau_tolerance)
+        has_plateaued(
+            list(of_seed), config.budget.plateau_segments, config.budget.plateau_tolerance
+        )
         for of_seed in np.atleast_2d(rewards)
     )
 

@@ -66,20 +66,25 @@ class Sac(NamedTuple):
 
 def make(config: Config, observation_size: int, action_size: int, inputs: Inputs) -> Sac:
     """A learner of that size, with the settings of the config."""
+    own = config.learner
     return Sac(
-        actor=Actor(action_size, config.hidden_layers, config.hidden_size),
-        critic=Critic(config.hidden_layers, config.hidden_size, config.critic_layer_norm),
+        actor=Actor(action_size, own.hidden_layers, own.hidden_size),
+        critic=Critic(
+            own.hidden_layers,
+            own.hidden_size,
+            own.critic_layer_norm,
+        ),
         inputs=inputs,
         observation_size=observation_size,
         action_size=action_size,
-        target_entropy=-config.target_entropy_scale * action_size,
-        initial_temperature=config.initial_temperature,
-        discount=config.discount,
-        soft_update_rate=config.soft_update_rate,
-        optimizer=optax.adam(config.learning_rate),
-        normalizes=config.normalize_inputs,
-        lagrangian=config.lagrangian_entropy,
-        average_rate=config.actor_average,
+        target_entropy=-own.target_entropy_scale * action_size,
+        initial_temperature=own.initial_temperature,
+        discount=own.discount,
+        soft_update_rate=own.soft_update_rate,
+        optimizer=optax.adam(own.learning_rate),
+        normalizes=own.normalize_inputs,
+        lagrangian=own.lagrangian_entropy,
+        average_rate=own.actor_average,
     )
 
 

@@ -28,7 +28,7 @@ def rows(directory: Path, config: Config, num_seeds: int) -> list[Row]:
     """A row for each seed and iteration; computed once, and read from the directory afterwards."""
     path = directory / RESULTS
     asked = files.jsonable(
-        {"config": dataclasses.asdict(config), "seeds": num_seeds}
+        {"config": config.flat(), "seeds": num_seeds}
         | {"settings": dataclasses.asdict(settings_of(config))}
     )
     with contextlib.suppress(OSError, ValueError, AttributeError):  # none yet, or a damaged one
@@ -42,9 +42,11 @@ def rows(directory: Path, config: Config, num_seeds: int) -> list[Row]:
 
 def settings_of(config: Config) -> Settings:
     """MEPOL's own, in batches of about its own size that fit into an iteration's env steps."""
-    usual = Settings.num_episodes * config.episode_length
-    num_epochs = max(1, round(config.steps_per_iteration / usual))
-    num_episodes = config.steps_per_iteration // (num_epochs * config.episode_length)
+    usual = Settings.num_episodes * config.environment.episode_length
+    num_epochs = max(1, round(config.budget.steps_per_iteration / usual))
+    num_episodes = config.budget.steps_per_iteration // (
+        num_epochs * config.environment.episode_length
+    )
     return Settings(num_epochs=num_epochs, num_episodes=num_episodes)
 
 
@@ -54,7 +56,7 @@ def _train(config: Config, num_seeds: int) -> list[dict[str, Any]]:
     state = jax.jit(jax.vmap(lambda key: mepol.init(p, settings, key)))(keys)
     iterate = jax.jit(jax.vmap(lambda state: mepol.iterate(p, settings, state)))
     found = []
-    for iteration in range(1, config.num_iterations + 1):
+    for iteration in range(1, config.budget.num_iterations + 1):
         state, metrics = iterate(state)
         measured = {name: metrics[name].tolist() for name in COLUMNS if name in metrics}
         seconds = time.perf_counter() - started

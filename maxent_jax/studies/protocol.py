@@ -5,7 +5,6 @@ its own. All methods of a study have the same env steps and gradient steps, and 
 same projection. Loads no array library.
 """
 
-import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,8 +12,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from maxent_jax.config import DEFAULTS, Config, preset
-from maxent_jax.config.names import BASELINES, CLASSIC_ENVS, MUJOCO_ENVS
-from maxent_jax.config.presets import PLAIN
+from maxent_jax.config.registry import BASELINES, CLASSIC_ENVS, MUJOCO_ENVS, PLAIN
 from maxent_jax.errors import UsageError
 from maxent_jax.runs import files, integrity, locks
 
@@ -196,7 +194,7 @@ def claim(directory: Path, study: str, scale: str, cells: list[Cell]) -> None:
             "version": VERSION,
             "study": study,
             "scale": scale,
-            "cells": {cell.name: dataclasses.asdict(cell.config) for cell in cells},
+            "cells": {cell.name: cell.config.flat() for cell in cells},
         }
     )
     with locks.holding(directory):
@@ -241,7 +239,7 @@ def home(directory: Path, cell: Cell) -> Path:
     """
     own = directory / cell.name
     if not own.exists():
-        config = files.jsonable(dataclasses.asdict(cell.config))
+        config = files.jsonable(cell.config.flat())
         for study in sorted(directory.parent.glob(f"*/{STUDY}")):
             for name, held in _cells(study).items():
                 if held == config and (study.parent / name).exists():
@@ -264,7 +262,7 @@ def finished(directory: Path, cell: Cell) -> bool:
       RunError: what is saved there is a run with other settings.
     """
     at = home(directory, cell)
-    if integrity.checkpoints(at)[-1:] != [f"{cell.config.num_iterations}"]:
+    if integrity.checkpoints(at)[-1:] != [f"{cell.config.budget.num_iterations}"]:
         return False
     files.check_config(at, cell.config)
     return True

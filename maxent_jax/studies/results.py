@@ -33,10 +33,11 @@ ALONG: dict[str, tuple[str, Callable[[Config], float]]] = {
     "refresh_period": (
         "env steps between refreshes",
         lambda config: (
-            methods.row(config).refresh_period * config.num_envs or config.steps_per_iteration
+            methods.row(config).refresh_period * config.budget.num_envs
+            or config.budget.steps_per_iteration
         ),
     ),
-    "episodic_weight": ("λ", lambda config: config.episodic_weight),
+    "episodic_weight": ("λ", lambda config: config.intrinsic.episodic_weight),
 }
 
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from maxent_jax import mixture
-from maxent_jax.algorithm import methods
+from maxent_jax.config.registry import STARTS, MethodRow
 from maxent_jax.theory import tabular
 from maxent_jax.theory.mdps import Mdp
 
@@ -63,16 +63,14 @@ WEIGHTS: dict[str, Callable[[int, float], np.ndarray]] = {
 }
 
 
-def run(
-    mdp: Mdp, row: methods.Row, settings: Settings, first: np.ndarray, keys: jax.Array
-) -> Trace:
+def run(mdp: Mdp, row: MethodRow, settings: Settings, first: np.ndarray, keys: jax.Array) -> Trace:
     """The method from several first policies side by side.
 
     Args:
       mdp: one for all seeds, or one for each, with a leading axis [N] (mdps.stack).
-      row: a row of methods.ROWS. A refresh period counts planning steps. The history is the mean
-        occupancy of the agent's greedy policies, one after each planning step, and of the first
-        policy; the weights may be any of WEIGHTS.
+      row: a row of config.registry.METHODS. A refresh period counts planning steps. The history
+        is the mean occupancy of the agent's greedy policies, one after each planning step, and of
+        the first policy; the weights may be any of WEIGHTS.
       settings: of the run.
       first: [N, L, S, A] π_0 of each seed.
       keys: [N] for the noise.
@@ -94,7 +92,7 @@ def run(
         numbers = _Numbers(
             weights=jnp.asarray(table),
             refresh_period=jnp.asarray(row.refresh_period),
-            start=jnp.asarray(methods.STARTS.index(row.start)),
+            start=jnp.asarray(STARTS.index(row.start)),
             smoothing=jnp.asarray(settings.smoothing),
             density_noise=jnp.asarray(settings.density_noise),
             planning_noise=jnp.asarray(settings.planning_noise),
@@ -120,7 +118,7 @@ class _Numbers(NamedTuple):
 
     weights: jax.Array  # [P, P]
     refresh_period: jax.Array
-    start: jax.Array  # index into methods.STARTS
+    start: jax.Array  # index into STARTS
     smoothing: jax.Array
     density_noise: jax.Array
     planning_noise: jax.Array
@@ -198,7 +196,7 @@ def _iterate(mdp, numbers, shape, state, t, key):
 
 
 def _start(numbers, state, reward, t):
-    """The values that planning starts from, in the order of methods.STARTS."""
+    """The values that planning starts from, in the order of STARTS."""
     archived = jnp.arange(len(state.occupancies)) <= t
     best = jnp.where(archived, state.occupancies @ reward, -jnp.inf).argmax()
     values = state.agent.values
@@ -237,7 +235,7 @@ def _next_occupancy(mdp, numbers, shape, agent):
     return best + share * (worst - best), lost + share * ((best - worst) @ agent.reward)
 
 
-def _check(row: methods.Row, settings: Settings) -> None:
+def _check(row: MethodRow, settings: Settings) -> None:
     for name in ("num_iterations", "planning_steps"):
         if getattr(settings, name) < 1:
             raise ValueError(f"{name} is {getattr(settings, name)}, but must be at least 1")
@@ -246,7 +244,7 @@ def _check(row: methods.Row, settings: Settings) -> None:
     for name in ("density_noise", "planning_noise"):
         if not 0 <= getattr(settings, name) < np.inf:
             raise ValueError(f"{name} is {getattr(settings, name)}, but must be 0 or more")
-    known = {"weights": WEIGHTS, "reference": ("mixture", "history"), "start": methods.STARTS}
+    known = {"weights": WEIGHTS, "reference": ("mixture", "history"), "start": STARTS}
     for name, words in known.items():
         if getattr(row, name) not in words:
             raise ValueError(f"unknown {name} '{getattr(row, name)}': choose of {', '.join(words)}")

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from maxent_jax.algorithm import methods
+from maxent_jax.config.registry import MethodRow
 from maxent_jax.errors import UsageError
 from maxent_jax.theory import bounds, loop, mdps, optimum, tabular
 from maxent_jax.theory.mdps import Dynamics, Mdp
@@ -128,7 +128,7 @@ def read(path: Path, discount: float) -> Mdp:
         raise UsageError(f"--mdp {path} holds no MDP: {str(mistake).strip(chr(39))}.") from None
 
 
-def run(problem: Problem, row: methods.Row, iterations: int, **options: Any) -> loop.Trace:
+def run(problem: Problem, row: MethodRow, iterations: int, **options: Any) -> loop.Trace:
     """The method on the problem, with planning to convergence unless said otherwise."""
     settings = loop.Settings(
         **({"planning_steps": problem.converged} | options),

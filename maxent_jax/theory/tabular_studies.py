@@ -10,14 +10,14 @@ import numpy as np
 from scipy import special, stats
 
 from maxent_jax import rewards
-from maxent_jax.algorithm import methods
+from maxent_jax.config.registry import METHODS, MethodRow
 from maxent_jax.theory import bounds, loop, mdps, optimum, peers, reference, tabular
 from maxent_jax.theory import tabular_problems as problems
 from maxent_jax.theory.tabular_problems import FIT_FROM, Problem
 
 STATES = (2, 10, 100, 1_000, 10_000, 1_000_000)
 ETAS = (0.1, 0.01, 0.001)
-V, LA, H = (methods.ROWS[name] for name in ("v", "la", "h"))
+V, LA, H = (METHODS[name] for name in ("v", "la", "h"))
 ARCHIVED_EVERY = 64  # planning steps in an iteration where planning is not to convergence
 
 
@@ -118,7 +118,7 @@ def compare(problem: Problem, iterations: int) -> dict[str, Any]:
 
 def _method(
     problem: Problem,
-    row: methods.Row,
+    row: MethodRow,
     iterations: int,
     bound: Callable[[loop.Trace, np.ndarray], np.ndarray] | None = None,
     **options: Any,

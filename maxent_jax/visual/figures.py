@@ -2,12 +2,14 @@
 
 import multiprocessing
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
 import numpy as np
 
 from maxent_jax.analysis import load_run, paths
+from maxent_jax.config import registry
 from maxent_jax.density import histogram
 from maxent_jax.visual import plotting
 
@@ -27,7 +29,9 @@ def draw_missing(directory: Path) -> None:
     if jax.process_count() == 1:
         _draw(directory)
         return
-    alone = multiprocessing.get_context("spawn").Process(target=_draw, args=(directory,))
+    alone = multiprocessing.get_context("spawn").Process(
+        target=_draw, args=(directory, registry.imported)
+    )
     os.environ["JAX_PLATFORMS"] = "cpu"  # of the child: the accelerator's memory is taken
     alone.start()
     alone.join()
@@ -35,7 +39,8 @@ def draw_missing(directory: Path) -> None:
         raise RuntimeError(f"drawing the figures of {directory} failed; --resume tries again.")
 
 
-def _draw(directory: Path) -> None:
+def _draw(directory: Path, modules: Sequence[str] = ()) -> None:
+    registry.import_modules(modules)
     run = load_run(directory)
     visited = run.occupancy()
     cells = histogram.count(visited.states, run.components.grid, visited.weight)

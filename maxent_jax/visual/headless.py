@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 
-from maxent_jax.config.names import MUJOCO_ENVS
+from maxent_jax.config.registry import MUJOCO_ENVS
 from maxent_jax.errors import RunError
 
 VARIABLE = "MUJOCO_GL"

@@ -213,6 +213,6 @@ def _finish(figure: Figure, run: Run) -> Figure:
     figure.suptitle(
         f"MaxEnt-{config.method.upper()}, {config.env}, preset {config.preset}, seed {run.seed}"
     )
-    named = ", ".join(f"{name}={getattr(config, name)}" for name in config.deviations())
+    named = ", ".join(f"{name}={config[name]}" for name in config.deviations())
     figure.supxlabel(f"departs from the paper in: {named or 'nothing'}", fontsize=6, wrap=True)
     return figure

@@ -91,7 +91,7 @@ def results(seeds: Mapping[str, Sequence[Run]]) -> Table:
             name,
             f"MaxEnt-{run.config.method.upper()}, {run.config.env}, {run.config.preset}",
             str(run.seed),
-            f"{len(run.metrics.get('iteration', ()))} of {run.config.num_iterations}",
+            f"{len(run.metrics.get('iteration', ()))} of {run.config.budget.num_iterations}",
             *(number(last(run, metric), how) for metric, _, how in METRICS),
         ]
         for name, of_run in seeds.items()
@@ -169,7 +169,7 @@ def _reduced(run: Run, name: str, how: Callable[[np.ndarray], Any]) -> str:
 
 def departures(config: Config) -> Table:
     """What the run does otherwise than the paper, and why it says so."""
-    rows = [[name, str(getattr(config, name)), why] for name, why in config.deviations().items()]
+    rows = [[name, str(config[name]), why] for name, why in config.deviations().items()]
     return Table(["setting", "value", "what it means"], rows)
 
 

@@ -16,6 +16,7 @@ from brax.envs.base import State
 from maxent_jax import envs
 from maxent_jax.baselines.hazan.settings import Settings
 from maxent_jax.density import histogram
+from maxent_jax.envs import pendulum
 
 NUM_ACTIONS = 3  # backwards, none, forwards
 EPSILON = float(np.finfo(np.float32).eps)  # official: beside the deviation of the returns
@@ -82,7 +83,7 @@ def rollout(
     As in the official code, what the policy sees after an end is still the state at the goal.
     """
     env = envs.make(settings.env)
-    observed = envs.pendulum.observe(start) if settings.env == "pendulum" else start
+    observed = pendulum.observe(start) if settings.env == "pendulum" else start
     zero = jnp.zeros(())
 
     def step(carry, uniform):

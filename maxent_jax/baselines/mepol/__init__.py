@@ -56,7 +56,9 @@ def init(components: Components, settings: Settings, key: jax.Array) -> State:
         key=key,
         policy=policy,
         optimizer=ascent.ADAM.init(policy),
-        starts=base.init(components.env, 1, components.config.num_starts, key_starts).starts,
+        starts=base.init(
+            components.env, 1, components.config.environment.num_starts, key_starts
+        ).starts,
         visits=Visits(jnp.zeros(components.grid.bins, jnp.int32), zero),
         env_steps=zero,
         gradient_steps=zero,
@@ -132,7 +134,7 @@ def play(
         return mean + jnp.exp(log_std) * jax.random.normal(key_step, mean.shape)
 
     env = Clipped(components.env)
-    return rollout.episodes(env, starts, act, components.config.episode_length, key)
+    return rollout.episodes(env, starts, act, components.config.environment.episode_length, key)
 
 
 def batch_of(
@@ -154,7 +156,7 @@ def evaluate(components: Components, settings: Settings, state: State) -> Metric
     The same randomness every time; these episodes enter no count.
     """
     key_starts, key_play, key_rows = jax.random.split(jax.random.key(algorithm.EVALUATION_SEED), 3)
-    num_episodes = components.config.mixture_episodes
+    num_episodes = components.config.mixture.mixture_episodes
     starts = base.draw_starts(state.starts, num_episodes, key_starts)
     played = play(components, settings, state.policy, starts, key_play)
     alone, by_it = jnp.ones(1), jnp.zeros(num_episodes, jnp.int32)

@@ -1,0 +1,281 @@
+"""Environments, bonuses and methods by name, and what must be known of each before jax is loaded.
+
+To add one: a module, and a row of a table here. From outside the package, call
+`maxent_jax.envs.register`, `maxent_jax.intrinsic.register` or `register_method`: what they add has
+a name that begins with "user:". Loads no array library.
+"""
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from maxent_jax.checks import check_choice
+from maxent_jax.errors import ConfigError, ConfigTypeError, UsageError
+
+USER = "user:"
+BY_METHOD = -1  # a refresh period: that of the method
+CORRECTIVE = "fully_corrective"
+WEIGHTS = ("uniform", "geometric", "last", CORRECTIVE)
+REFERENCES = ("mixture", "history")
+STARTS = ("scratch", "last", "best")
+BACKENDS = ("auto", "mjx", "mujoco", "warp")
+PHYSICS = ("reference", "fast")
+
+
+class EnvironmentRow(NamedTuple):
+    """An environment."""
+
+    entry: Any = None  # an envs.Entry, or where to find one: "module:name"
+    backends: tuple[str, ...] = ("auto",)
+    physics: tuple[str, ...] = ("reference",)
+    is_robot: bool = False  # an envs.task.MujocoEnv: torques to limit, health that can fail
+    has_torso: bool = False  # a floating torso, with a heading; it can be turned, and upside down
+    in_metres: bool = True  # the first two features are a position in metres
+    time_limit: int = 1000  # of the paper, control steps
+
+
+class BonusRow(NamedTuple):
+    """An intrinsic reward with a state of its own."""
+
+    make: Any  # intrinsic.Setting -> intrinsic.Bonus, or where to find it: "module:name"
+    num_neighbors: int = 0  # k within a batch, which must be larger
+    baseline: bool = True  # it is a method too, under the same name: it pays one policy
+
+
+class MethodRow(NamedTuple):
+    """A method: an entry for each choice that the methods differ in."""
+
+    weights: str  # of the archived policies: see WEIGHTS
+    refresh_period: int  # steps of all envs between refreshes of the reward; 0: once an iteration
+    reference: str  # the states that the reward is measured against: see REFERENCES
+    start: str  # the agent that an iteration starts from: see STARTS
+    settings: Mapping[str, Any] = MappingProxyType({})  # its others, whatever the preset
+
+
+def _robot(name: str, has_torso: bool) -> EnvironmentRow:
+    return EnvironmentRow(f"maxent_jax.envs.{name}:ENTRY", BACKENDS, PHYSICS, True, has_torso)
+
+
+def _classic(name: str) -> EnvironmentRow:
+    return EnvironmentRow(f"maxent_jax.envs.{name}:ENTRY", in_metres=False, time_limit=200)
+
+
+def _bonus(module: str, num_neighbors: int = 0, make: str = "make", **more: Any) -> BonusRow:
+    return BonusRow(f"maxent_jax.intrinsic.{module}:{make}", num_neighbors, **more)
+
+
+ENVIRONMENTS = {
+    "ant": _robot("ant", has_torso=True),
+    "walker2d": _robot("walker2d", has_torso=False),
+    "humanoid": _robot("humanoid", has_torso=True),
+    "pendulum": _classic("pendulum"),
+    "mountain_car": _classic("mountain_car"),
+}
+BRAX_ENVS = (
+    *("ant", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum"),
+    *("inverted_double_pendulum", "pusher", "reacher", "swimmer", "walker2d"),
+)
+_BRAX = EnvironmentRow(backends=("auto", "mjx"))
+_USERS = EnvironmentRow(backends=BACKENDS, physics=PHYSICS)
+
+BONUSES = {
+    "rnd": _bonus("rnd"),
+    "icm": _bonus("icm"),
+    "ngu": _bonus("ngu"),
+    "re3": _bonus("re3", 3),
+    "rise": _bonus("rise", 5),
+    "renyi": _bonus("rise", 5, "make_renyi"),
+    "vcse": _bonus("vcse", 12),
+    "kmeans": _bonus("kmeans"),
+    "apt": _bonus("apt", 12),
+    "histogram": _bonus("histogram", baseline=False),
+}
+
+# The learner of methods as their authors published them, and of the baselines.
+PLAIN: dict[str, Any] = {"shaping": 0.0, "return_steps": 1}
+# Bonuses are divided by their deviation; the distance to the reference has its own scale instead.
+_AS_PUBLISHED = PLAIN | {"episodic_weight": 0.0, "reward_scale": 1.0}
+
+
+def _baseline(bonus: str) -> MethodRow:
+    return MethodRow("last", 0, "mixture", "last", _AS_PUBLISHED | {"bonus": bonus})
+
+
+METHODS = {
+    "h": MethodRow("geometric", 0, "mixture", "scratch"),
+    "la": MethodRow("uniform", 1, "history", "last"),
+    "v": MethodRow("uniform", 0, "mixture", "best"),
+    "h-official": MethodRow(
+        *("geometric", 0, "mixture", "scratch"),
+        _AS_PUBLISHED | {"bonus": "histogram", "mixing": "step", "leave_own_out": False},
+    ),
+    **{name: _baseline(name) for name, row in BONUSES.items() if row.baseline},
+}
+
+ENVS = tuple(ENVIRONMENTS)
+MUJOCO_ENVS = tuple(name for name, row in ENVIRONMENTS.items() if row.is_robot)
+CLASSIC_ENVS = tuple(name for name, row in ENVIRONMENTS.items() if not row.is_robot)
+BASELINES = tuple(name for name, row in BONUSES.items() if row.baseline)
+
+_REGISTERED_BY = {
+    "environment": "maxent_jax.envs.register",
+    "bonus": "maxent_jax.intrinsic.register",
+    "method": "maxent_jax.config.register_method",
+}
+
+imported: list[str] = []
+"""The modules that were imported for what they register, as the user named them."""
+
+
+def is_users(name: object) -> bool:
+    """Whether a name is that of something a user registers."""
+    return isinstance(name, str) and name.startswith(USER) and name != USER
+
+
+def environment(name: str) -> EnvironmentRow:
+    """The row of an environment; a general one for a user's that is not registered yet.
+
+    Raises:
+      ConfigError: an unknown name.
+    """
+    brax = tuple(f"brax:{env}" for env in BRAX_ENVS)
+    if is_users(name):
+        return ENVIRONMENTS.get(name, _USERS)
+    check_choice("env", name, (*ENVS, *brax))
+    return _BRAX if name in brax else ENVIRONMENTS[name]
+
+
+def method(name: str) -> MethodRow:
+    """The row of a method.
+
+    Raises:
+      ConfigError: an unknown name, or a user's method that is not registered.
+    """
+    return _row("method", name, METHODS)
+
+
+def bonus(name: str) -> BonusRow:
+    """The row of a bonus.
+
+    Raises:
+      ConfigError: an unknown name, or a user's bonus that is not registered.
+    """
+    return _row("bonus", name, BONUSES)
+
+
+def check_name(kind: str, name: Any) -> None:
+    """Raises ConfigTypeError unless something can be registered under the name."""
+    if not isinstance(name, str) or not name:
+        raise ConfigTypeError(
+            f"the {kind}'s name is {name!r}, but must be a string that is not empty."
+        )
+
+
+def register_environment(name: str, row: EnvironmentRow) -> None:
+    """See envs.register, which makes the row."""
+    ENVIRONMENTS[f"{USER}{name}"] = row
+
+
+def register_bonus(name: str, row: BonusRow) -> None:
+    """See intrinsic.register, which makes the row. The bonus is a method too."""
+    name = f"{USER}{name}"
+    BONUSES[name], METHODS[name] = row, _baseline(name)
+
+
+def register_method(
+    name: str, weights: str, refresh_period: int, reference: str, start: str, **settings: Any
+) -> None:
+    """Makes a method known as "user:NAME", which is then trained like any other.
+
+    Args:
+      weights: of the archived policies: uniform, geometric, last or fully_corrective.
+      refresh_period: steps of all environments between refreshes of the reward; 0: one refresh an
+        iteration.
+      reference: the states that the reward is measured against: mixture or history.
+      start: the agent that an iteration starts from: scratch, last or best.
+      **settings: other settings of `Config` that the method has, whatever the preset.
+    Raises:
+      ConfigError: a value that no method can have.
+    """
+    check_name("method", name)
+    check_choice("weights", weights, WEIGHTS)
+    check_choice("reference", reference, REFERENCES)
+    check_choice("start", start, STARTS)
+    if not isinstance(refresh_period, int) or refresh_period < 0:
+        raise ConfigTypeError(
+            f"refresh_period is {refresh_period!r}, but must be a whole number from 0 up."
+        )
+    if weights == CORRECTIVE:  # a computation of the program, where the others are a table
+        settings, weights = {"weights": CORRECTIVE, **settings}, "uniform"
+    METHODS[f"{USER}{name}"] = MethodRow(weights, refresh_period, reference, start, settings)
+
+
+def check_registered(env: str, method_name: str, bonus_name: str) -> None:
+    """Raises ConfigError where one of these is a user's and is not registered."""
+    if is_users(env) and env not in ENVIRONMENTS:
+        raise not_registered("environment", env)
+    method(method_name)
+    if bonus_name != "none":
+        bonus(bonus_name)
+
+
+def resolve(where: Any) -> Any:
+    """The object at "module:name"; anything but a string stands for itself."""
+    if not isinstance(where, str):
+        return where
+    module, name = where.split(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def import_modules(modules: Sequence[str]) -> None:
+    """Imports a user's modules for what they register: by name, or by the path of a .py file.
+
+    Raises:
+      UsageError: there is no such module, or it fails.
+    """
+    for name in modules:
+        try:
+            if name.endswith(".py"):
+                _import_file(Path(name))
+            else:
+                _import_by_name(name)
+        except Exception as error:
+            raise UsageError(
+                f"import is '{name}', which cannot be imported: {type(error).__name__}: {error}."
+            ) from error
+        if name not in imported:
+            imported.append(name)
+
+
+def _import_by_name(name: str) -> None:
+    if "" not in sys.path and str(Path.cwd()) not in sys.path:  # as with python -m
+        sys.path.insert(0, str(Path.cwd()))
+    importlib.import_module(name)
+
+
+def _import_file(path: Path) -> None:
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise FileNotFoundError("no such file")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+
+
+def not_registered(kind: str, name: str) -> ConfigError:
+    """The error for a user's name that nothing was registered under."""
+    return ConfigError(
+        f"{kind} '{name}' is not registered: call {_REGISTERED_BY[kind]} first; on a command line, "
+        f"name the module that does with --import."
+    )
+
+
+def _row(kind: str, name: str, table: Mapping[str, Any]) -> Any:
+    if is_users(name) and name not in table:
+        raise not_registered(kind, name)
+    check_choice(kind, name, table)
+    return table[name]

@@ -1,0 +1,99 @@
+"""What a user adds from outside the package is trained and analysed like what comes with it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from maxent_jax.commands import evaluate, train
+from maxent_jax.config import preset, registry
+from maxent_jax.errors import ConfigError, ConfigTypeError, UsageError
+
+MODULE = Path(__file__).parent / "user_module.py"
+SMOKE = ["--preset", "smoke", "--num-iterations", "1"]
+
+
+@pytest.fixture
+def restored_tables():
+    """What a test registers is gone after it."""
+    tables = (registry.ENVIRONMENTS, registry.BONUSES, registry.METHODS, registry.imported)
+    kept = [table.copy() for table in tables]
+    yield
+    for table, before in zip(tables, kept, strict=True):
+        table.clear()
+        table.update(before) if isinstance(table, dict) else table.extend(before)
+
+
+@pytest.mark.parametrize("method", ["user:far", "user:newest"])
+def test_a_users_environment_and_method_are_trained_from_the_command_line(tmp_path, method):
+    run = tmp_path / "run"
+    words = ["train", *SMOKE, "--env", "user:point", "--method", method, "--out", str(run)]
+    command = [sys.executable, "-m", "maxent_jax"]
+    with_module = [*command, *words, "--import", str(MODULE)]
+    done = subprocess.run(with_module, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    saved = json.loads((run / "config.json").read_text())
+    assert saved["imported"] == [str(MODULE)]
+    assert saved["config"]["intrinsic"]["bonus"] == ("user:far" if "far" in method else "none")
+    assert saved["method"]["weights"] == "last"
+    rows = (run / "metrics.jsonl").read_text().splitlines()
+    assert 10 < json.loads(rows[-1])["cumulative_coverage"] <= 400  # cells of the user's grid
+
+    evaluated = [*command, "evaluate", str(run), "--episodes", "1"]
+    without = subprocess.run(evaluated, capture_output=True, text=True, check=False)
+    assert without.returncode == 2 and "'user:point' is not registered" in without.stderr
+    evaluated += ["--import", str(MODULE)]
+    assert subprocess.run(evaluated, capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--env", "user:none"], "environment 'user:none' is not registered: call maxent_jax.envs"),
+        (["--method", "user:none"], "method 'user:none' is not registered: call maxent_jax.config"),
+        (["--bonus", "user:none"], "bonus 'user:none' is not registered: call maxent_jax.intrin"),
+        (["--import", "no_such"], "cannot be imported: ModuleNotFoundError: No module named"),
+        (["--import", "no_such.py"], "cannot be imported: FileNotFoundError: no such file"),
+    ],
+)
+def test_what_is_not_registered_is_refused_before_anything_is_trained(words, says, tmp_path):
+    with pytest.raises((ConfigError, UsageError), match=says):
+        train.main(["--preset", "smoke", *words, "--out", str(tmp_path / "run")])
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_module_that_fails_is_named_with_its_reason(tmp_path):
+    broken = tmp_path / "broken.py"
+    broken.write_text("1 / 0")
+    with pytest.raises(UsageError, match=r"broken.py', which cannot .*ZeroDivisionError: division"):
+        evaluate.main([str(tmp_path), "--import", str(broken)])
+
+
+def test_a_methods_settings_are_its_own(restored_tables):
+    registry.register_method("mine", "fully_corrective", 5, "history", "scratch", eta=0.5)
+    config = preset("smoke", method="user:mine", env="pendulum")
+    assert config.mixture.eta == 0.5 and config.mixture.weights == "fully_corrective"
+    assert registry.method("user:mine").refresh_period == 5
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (("", "last", 0, "mixture", "last"), "method's name is ''"),
+        (("m", "lst", 0, "mixture", "last"), "unknown weights 'lst': did you mean 'last'"),
+        (("m", "last", -1, "mixture", "last"), "refresh_period is -1"),
+        (("m", "last", 0, "mix", "last"), "unknown reference 'mix'"),
+        (("m", "last", 0, "mixture", "first"), "unknown start 'first'"),
+    ],
+)
+def test_a_method_that_no_run_can_have_is_refused(restored_tables, wrong, says):
+    with pytest.raises(ConfigError, match=says):
+        registry.register_method(*wrong)
+
+
+def test_an_unknown_setting_of_a_method_is_refused_where_it_is_used(restored_tables):
+    registry.register_method("mine", "last", 0, "mixture", "last", etta=0.5)
+    with pytest.raises(ConfigTypeError, match="unknown setting 'etta': did you mean 'eta'"):
+        preset("smoke", method="user:mine")
