@@ -21,8 +21,8 @@ import numpy as np
 from benchmarks import common
 from benchmarks.envs import scan, settled
 from maxent_jax import algorithm, components, envs
-from maxent_jax.config import preset
-from maxent_jax.envs import base
+from maxent_jax.config import preset, registry
+from maxent_jax.envs import base, entries
 from maxent_jax.envs.physics import REFERENCE, Options
 from maxent_jax.envs.task import MujocoEnv
 from maxent_jax.runs import runtime
@@ -202,7 +202,8 @@ def survive(name: str, num_steps: int, num_envs: int) -> dict[str, Any]:
 
 def learn(name: str, label: str, seed: int) -> dict[str, Any]:
     """One iteration of preset `quick` on a physics; the mixture is played there too."""
-    envs.TASKS[name] = envs.TASKS[name]._replace(fast=OPTIONS[name][label])
+    row, task = registry.ENVIRONMENTS[name], envs.TASKS[name]._replace(fast=OPTIONS[name][label])
+    registry.ENVIRONMENTS[name] = row._replace(entry=entries.of_task(task))
     components._make.cache_clear()
     jax.clear_caches()  # which know the environment by its name
     config = preset("quick", env=name, physics="fast", backend="mujoco", seed=seed)
