@@ -1,4 +1,4 @@
-"""Builds the C++ of maxent_jax/native where there is a compiler; the package works without."""
+"""Builds the C++ of maxent_jax/native if there is a compiler; the package works without it."""
 
 import copy
 import importlib.util
@@ -15,7 +15,7 @@ try:
 except ModuleNotFoundError:  # older than pyproject.toml asks for: enough for `build_ext --inplace`
     bdist_wheel = object
 
-# The library is compiled once for each; at run time the one that the processor can run is loaded.
+# The library is compiled once for each; at run time, the one that fits the processor is loaded.
 X86_64 = {"v4": "-march=x86-64-v4", "v3": "-march=x86-64-v3"}
 ARM64 = {"v8": "-march=armv8-a"}
 MACHINES = {"x86_64": X86_64, "amd64": X86_64, "aarch64": ARM64, "arm64": ARM64}
@@ -25,25 +25,25 @@ NATIVE = Path("maxent_jax", "native")
 
 
 def headers(package: str) -> str:
-    """The folder of the C headers that an installed package brings."""
+    """Returns the folder of the C headers in an installed package."""
     spec = importlib.util.find_spec(package)
     return str(Path(spec.origin).parent / "include")
 
 
 def extension(variant: str, architecture: str) -> Extension:
-    """The library for one kind of processor."""
+    """Returns the library for one kind of processor."""
     return Extension(
         f"maxent_jax.native._{variant}",
         [str(NATIVE / name) for name in ("knn.cc", "physics.cc")],
         depends=[str(NATIVE / "parallel.h")],
         include_dirs=[str(NATIVE), headers("jaxlib"), headers("mujoco")],
         extra_compile_args=[*FLAGS, architecture],
-        optional=True,  # a machine without a compiler gets the package all the same
+        optional=True,  # a machine without a compiler still gets the package
     )
 
 
 class BuildVariants(build_ext):
-    """Side by side, each with object files of its own: the sources have the same names."""
+    """Builds the variants in parallel, each with its own object files: source names are equal."""
 
     def build_extension(self, ext: Extension) -> None:  # noqa: D102
         if ext is for_gpus:
@@ -56,12 +56,12 @@ class BuildVariants(build_ext):
         super(BuildVariants, own).build_extension(ext)
 
     def get_ext_filename(self, fullname: str) -> str:
-        """Without the tag of a Python version: ctypes loads them, Python does not import them."""
+        """Leaves out the tag of a Python version: ctypes loads the libraries, not Python."""
         return f"{Path(*fullname.split('.'))}.so"
 
 
 class AnyPython(bdist_wheel):
-    """One wheel for every version of Python: its libraries know nothing of Python."""
+    """Makes one wheel for every version of Python: the libraries do not depend on Python."""
 
     def get_tag(self) -> tuple[str, str, str]:  # noqa: D102
         return "py3", "none", super().get_tag()[2]
@@ -75,7 +75,7 @@ which_runs = Extension(
     extra_compile_args=["-O2", "-g0"],
     optional=True,
 )
-# For NVIDIA's GPUs where it is asked for: the name or path of nvcc.
+# For NVIDIA's GPUs, only if MAXENT_JAX_NVCC is set: the name or path of nvcc.
 nvcc = shutil.which(os.environ.get("MAXENT_JAX_NVCC", ""))
 for_gpus = Extension(
     "maxent_jax.native._cuda",
@@ -83,7 +83,7 @@ for_gpus = Extension(
     depends=[str(NATIVE / "knn_thread.h")],
     extra_compile_args=[
         *(str(nvcc), "-O3", "-std=c++17", "-shared", "-Xcompiler", "-fPIC", "-w"),
-        # Code for Hopper, and for what comes after it what a driver compiles.
+        # Code for Hopper; for later GPUs, code that the driver compiles.
         "-gencode=arch=compute_90,code=[sm_90,compute_90]",
         *("-I", str(NATIVE), "-I", headers("jaxlib")),
     ],

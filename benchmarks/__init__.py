@@ -1,1 +1,1 @@
-"""One question each: `python -m benchmarks.<name>`; the last lines are JSON, one a row."""
+"""Benchmarks: `python -m benchmarks.<name>` answers one question; the last lines are JSON rows."""

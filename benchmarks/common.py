@@ -1,4 +1,4 @@
-"""What every benchmark prints and measures alike."""
+"""What all benchmarks share: flags, timing and printing."""
 
 import argparse
 import importlib
@@ -24,7 +24,7 @@ REPEATS = 5
 
 
 class Peer(NamedTuple):
-    """Another library that answers the same question; no dependency of ours."""
+    """Another library that answers the same question; not a dependency of this package."""
 
     distribution: str
     module: str
@@ -32,15 +32,17 @@ class Peer(NamedTuple):
 
 
 def parser(description: str | None) -> argparse.ArgumentParser:
-    """The flags that benchmarks share."""
+    """Returns the parser with the flags that benchmarks share."""
     flags = argparse.ArgumentParser(description=description)
-    flags.add_argument("--toy", action="store_true", help="does it run? tiny sizes, no figures")
-    flags.add_argument("--repeats", type=int, default=REPEATS, help="of which the median is taken")
+    flags.add_argument("--toy", action="store_true", help="check that it runs, with tiny sizes")
+    flags.add_argument(
+        "--repeats", type=int, default=REPEATS, help="number of measurements; the median counts"
+    )
     return flags
 
 
 def print_versions(peers: Iterable[Peer] = ()) -> None:
-    """The first line of every benchmark: what was measured, on what."""
+    """Prints the first line of every benchmark: the versions and the machine."""
     versions = " ".join(f"{name} {importlib.metadata.version(name)}" for name in PACKAGES)
     for peer in peers:
         try:
@@ -57,7 +59,7 @@ def print_versions(peers: Iterable[Peer] = ()) -> None:
 
 
 def _processor() -> str:
-    """Its name, where Linux tells."""
+    """The processor's name, if Linux gives it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -67,12 +69,12 @@ def _processor() -> str:
 
 
 def importable(peers: Iterable[Peer]) -> list[tuple[Peer, ModuleType]]:
-    """Those that can be measured here; the others are named in one line on standard error."""
+    """Returns the peers that can be imported; names the others in one line on standard error."""
     found, absent = [], []
     for peer in peers:
         try:
             found.append((peer, importlib.import_module(peer.module)))
-        except Exception as error:  # one that is installed but broken raises anything at all
+        except Exception as error:  # a broken installation may raise anything
             absent.append(f"{peer.distribution} ({sentence(error)})")
     if absent:
         print("not measured: " + "; ".join(absent), file=sys.stderr)
@@ -80,28 +82,28 @@ def importable(peers: Iterable[Peer]) -> list[tuple[Peer, ModuleType]]:
 
 
 def measured(peer: Peer, measure: Callable, *args: Any) -> Any:
-    """What the peer gives; None, and one line on standard error, where it fails."""
+    """Returns the peer's measurement; if it fails, None, and one line on standard error."""
     try:
         return measure(*args)
-    except Exception as error:  # whatever a library raises costs its own row, never another's
+    except Exception as error:  # a peer that fails loses its own row and no other
         print(f"not measured: {peer.distribution} ({sentence(error)})", file=sys.stderr)
         return None
 
 
 def sentence(error: Exception) -> str:
-    """The class and first line of what was raised."""
+    """Returns the class and the first line of an exception."""
     return f"{type(error).__name__}: {error}".splitlines()[0]
 
 
 def compiled(function: Callable, *args: Any) -> tuple[Callable, float]:
-    """The function compiled for arguments like these, and the seconds that took."""
+    """Compiles the function for arguments like these; returns it and the seconds that this took."""
     started = time.perf_counter()
     program = jax.jit(function).lower(*args).compile()
     return program, time.perf_counter() - started
 
 
 def median_seconds(call: Callable[[], Any], repeats: int = REPEATS) -> float:
-    """Median time of a call that returns arrays, after one call to warm up."""
+    """Returns the median time of a call that returns arrays, after one call to warm up."""
     jax.block_until_ready(call())
     seconds = []
     for _ in range(repeats):
@@ -112,7 +114,7 @@ def median_seconds(call: Callable[[], Any], repeats: int = REPEATS) -> float:
 
 
 def progress(row: dict[str, Any]) -> None:
-    """The row's values on standard error."""
+    """Prints the row's values on standard error."""
     print(
         " ".join(f"{name}={value}" for name, value in rounded(row).items()),
         file=sys.stderr,
@@ -121,14 +123,12 @@ def progress(row: dict[str, Any]) -> None:
 
 
 def emit(row: dict[str, Any]) -> None:
-    """One JSON line on standard output as soon as it is measured; where that is no terminal, its
-    values on standard error too.
-    """
+    """Prints a row as a JSON line; if standard output is no terminal, on standard error too."""
     print(json.dumps(rounded(row)), flush=True)
     if not sys.stdout.isatty():
         progress(row)
 
 
 def rounded(row: dict[str, Any]) -> dict[str, Any]:
-    """Numbers to four significant digits."""
+    """Returns the row with numbers rounded to four significant digits."""
     return {k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in row.items()}

@@ -1,8 +1,8 @@
-"""How long until a run's first training step, with an empty compilation cache and a filled one?
+"""How long until a run's first training step, with an empty or a filled compilation cache?
 
-Runs `experiments.train` in processes of their own, for one step of all envs a segment. Seconds
-count from the start of its main to the end of the first segment: imports, compilation, the first
-rollouts of the mixture, one step with its gradient steps.
+Each measurement runs `experiments.train` in its own process, with one vector step per segment. The
+time is from the start of its main to the end of the first segment: imports, compilation, the first
+rollouts of the mixture, and one vector step with its gradient steps.
 """
 
 import os
@@ -24,7 +24,7 @@ TRAIN = ("-m", "experiments.train", "--num-iterations", "1")
 
 
 def first_step(env: str, name: str, directory: Path, cache: Path) -> float:
-    """Seconds until the first step of a run, which ends soon after it."""
+    """Returns the seconds until a run's first step; the run ends soon after it."""
     config = preset(name, env=env)
     steps = config.budget.num_envs * config.budget.num_segments
     flags = ("--env", env, "--preset", name, "--steps-per-iteration", str(steps))
@@ -39,7 +39,7 @@ def first_step(env: str, name: str, directory: Path, cache: Path) -> float:
 
 
 def measure(env: str, name: str, repeats: int) -> Iterator[dict[str, Any]]:
-    """A row with an empty cache, and one with what that left behind."""
+    """Yields a row with an empty cache, and one with the cache that the first runs filled."""
     with tempfile.TemporaryDirectory() as folder:
         caches = [Path(folder, f"cache-{i}") for i in range(repeats)]
         for kind in ("cold", "warm"):

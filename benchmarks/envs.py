@@ -1,10 +1,10 @@
-"""How many env steps a second does each physics backend make, and its peers?
+"""How many env steps per second do the physics backends make, compared with other libraries?
 
-Random actions. Ours and bare `mujoco.rollout` start from the same states on the ground and take the
-same actions without resets, so that beside each rate stands how far its motion departs from that of
-C MuJoCo: a solver that stops early is faster, and is not the same environment. Gymnasium and
-EnvPool reset whoever falls, and robots that lie cost more than robots that stand: they compare with
-our row `episodes`, which does so too.
+Actions are random. Our backends and bare `mujoco.rollout` start from the same states on the ground
+and take the same actions without resets. So each rate comes with the distance of its motion from
+that of C MuJoCo: a solver that stops early is faster, but is not the same environment. Gymnasium
+and EnvPool reset robots that fall, and robots that lie cost more than robots that stand. Compare
+them with our row `episodes`, which also resets.
 """
 
 import functools
@@ -27,16 +27,16 @@ from maxent_jax.envs import base, physics
 from maxent_jax.envs.task import MujocoEnv
 from maxent_jax.runs import runtime
 
-# Random actions before a workload starts: an ant has landed, the others have not fallen yet.
+# Random actions before a workload starts: then an ant has landed, and the others still stand.
 SETTLE_STEPS = {"ant": 40, "walker2d": 5, "humanoid": 5}
 MIN_STEPS = DRIFT_STEPS = 50  # of each env
-MUJOCO_STEPS = 6400  # of all envs together, at least; C MuJoCo is too fast for fewer
+MUJOCO_STEPS = 6400  # of all envs together, at least; C MuJoCo is too fast to time fewer
 SEED = 0
 GYMNASIUM = {"ant": "Ant-v4", "walker2d": "Walker2d-v4", "humanoid": "Humanoid-v4"}
 
 
 class Workload(NamedTuple):
-    """What every implementation is given; the peers with states of their own take the actions."""
+    """The same for every implementation; peers that make their own states take only the actions."""
 
     env: MujocoEnv
     starts: Any  # env states, [N, ...]
@@ -44,27 +44,27 @@ class Workload(NamedTuple):
 
     @property
     def num_steps(self) -> int:
-        """Env steps, all envs together."""
+        """Env steps of all envs together."""
         return self.actions.shape[0] * self.actions.shape[1]
 
 
 class Measurement(NamedTuple):
-    """Of one workload."""
+    """The measurement of one workload."""
 
     steps_per_second: float
-    positions: np.ndarray | None  # [T, N, nq] after each control step, where states can be set
+    positions: np.ndarray | None  # [T, N, nq] after each control step, if states can be set
     extra: dict[str, float]  # further columns
 
 
 def make_workload(name: str, backend: str, profile: str, num_envs: int, num_steps: int) -> Workload:
-    """An environment, and the states and actions that all are given."""
+    """Makes an environment, and the states and actions for all implementations."""
     ground = MujocoEnv(envs.TASKS[name], "mujoco")
     starts, actions = settled(ground, num_envs, num_steps, SEED)
     return Workload(MujocoEnv(envs.TASKS[name], backend, profile), starts, actions)
 
 
 def settled(env: MujocoEnv, num_envs: int, num_steps: int, seed: int) -> tuple[Any, np.ndarray]:
-    """States [N, ...] after some random actions, and further actions [T, N, A]."""
+    """Returns states [N, ...] after some random actions, and further actions [T, N, A]."""
     random = np.random.default_rng(seed)
     settle = SETTLE_STEPS[env.task.name]
     shape = (settle + num_steps, num_envs, env.action_size)
@@ -75,7 +75,7 @@ def settled(env: MujocoEnv, num_envs: int, num_steps: int, seed: int) -> tuple[A
 
 
 def scan(env: MujocoEnv, starts: Any, actions: jax.Array) -> tuple[Any, jax.Array]:
-    """The last states, and the observations [T, N, D] after each step."""
+    """Returns the last states, and the observations [T, N, D] after each step."""
 
     def step(state, action):
         state = jax.vmap(env.step)(state, action)
@@ -94,7 +94,7 @@ def ours(workload: Workload, repeats: int) -> Measurement:
 
 
 def with_episodes(workload: Workload, repeats: int) -> Measurement:
-    """Ours as training runs it: whoever falls or becomes too old starts anew."""
+    """Measures ours as in training: an episode that ends is followed by a new one."""
     actions = jnp.asarray(workload.actions)
     keys = jax.random.split(jax.random.key(SEED), len(actions))
 
@@ -116,14 +116,14 @@ def with_episodes(workload: Workload, repeats: int) -> Measurement:
 
 
 def bare_rollout(workload: Workload, repeats: int) -> Measurement:
-    """C MuJoCo on all cores, of the reference model, all steps known in advance: the ceiling."""
+    """Measures the upper limit: C MuJoCo on all cores, with all steps known in advance."""
     task = workload.env.task
     model = physics.load_model(task.xml)
     full = mujoco.mjtState.mjSTATE_FULLPHYSICS
     starts = np.zeros((workload.actions.shape[1], mujoco.mj_stateSize(model, full)))
     where_qpos, where_qvel = slice(1, 1 + model.nq), slice(1 + model.nq, 1 + model.nq + model.nv)
     given = jax.tree.map(np.asarray, workload.starts.pipeline_state)
-    starts[:, where_qpos], starts[:, where_qvel] = given.qpos, given.qvel  # after the time
+    starts[:, where_qpos], starts[:, where_qvel] = given.qpos, given.qvel  # the time comes first
     warmstart = given.warmstart.astype(np.float64)
     # [N, T × frame skip, A]: each control is held for a control step
     controls = np.repeat(in_control_range(model, workload.actions), task.frame_skip, axis=0)
@@ -158,7 +158,7 @@ def envpool_threads(envpool, workload: Workload, repeats: int) -> Measurement:
 
 
 def stepped(env, workload: Workload, repeats: int) -> Measurement:
-    """A vector env of Gymnasium's interface, with the episodes and resets that it makes itself."""
+    """Measures a vector env with Gymnasium's interface, with its own episodes and resets."""
     actions = in_control_range(workload.env.model, workload.actions)
     env.reset()
 
@@ -172,7 +172,7 @@ def stepped(env, workload: Workload, repeats: int) -> Measurement:
 
 
 def brax_on_mjx(brax_envs, workload: Workload, repeats: int) -> Measurement:
-    """brax's own environment of that name: another model, with other options."""
+    """Measures brax's environment of the same name: another model, with other options."""
     env = brax_envs.get_environment(workload.env.task.name, backend="mjx")
     num_envs = workload.actions.shape[1]
     starts = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(SEED), num_envs))
@@ -190,7 +190,7 @@ PEERS = (
 
 
 def fidelity(env: MujocoEnv, found: Measurement, truth: Measurement) -> dict[str, float]:
-    """How far the motion lies from that of C MuJoCo, which computes in float64."""
+    """Returns the distance of the motion from that of C MuJoCo, which computes in float64."""
     if found.positions is None or truth.positions is None or found is truth:
         return {}
     departure = found.positions - truth.positions
@@ -204,7 +204,7 @@ def fidelity(env: MujocoEnv, found: Measurement, truth: Measurement) -> dict[str
 
 
 def measure(cases, peers, repeats: int) -> Iterator[dict[str, Any]]:
-    """Rows for each case (env, backend, physics, envs, steps), and for the peers at equal sizes."""
+    """Yields rows for each case (env, backend, physics, envs, steps), and for peers at its size."""
     ceilings: dict[tuple[str, int, int], Measurement] = {}
 
     def row(who: str, workload: Workload, found: Measurement, ceiling: Measurement, **more):
@@ -247,7 +247,9 @@ def main() -> None:
     flags.add_argument("--mjx-envs", type=int, nargs="*", default=[64, 256])
     flags.add_argument("--warp-envs", type=int, nargs="*", default=[])
     flags.add_argument("--mjx-physics", nargs="*", choices=PHYSICS, default=list(PHYSICS))
-    flags.add_argument("--no-peers", action="store_true", help="but bare mujoco.rollout")
+    flags.add_argument(
+        "--no-peers", action="store_true", help="no other library than mujoco.rollout"
+    )
     args = flags.parse_args()
     runtime.prepare(simulates_in_jax=True)
     common.print_versions(PEERS)
@@ -261,7 +263,7 @@ def main() -> None:
         cases += [(name, "warp", "reference", n, MIN_STEPS) for n in args.warp_envs]
     peers = [] if args.no_peers else common.importable(PEERS)
     if args.toy:
-        print("toy: without mjx, which compiles for tens of seconds", file=sys.stderr)
+        print("toy: without mjx, whose compilation takes tens of seconds", file=sys.stderr)
         cases = [("humanoid", "mujoco", "reference", 4, 4)]
         peers = [(peer, module) for peer, module in peers if peer.module == "gymnasium"]
     for row in measure(cases, peers, args.repeats):

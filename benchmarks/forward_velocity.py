@@ -1,7 +1,7 @@
 """Does the learner learn? SAC on Ant's forward velocity, with the settings of a preset.
 
-A check that separates a broken learner from a hard reward: the same environment, networks, replay
-and update as in training, but paid for metres per second along x.
+This check separates a broken learner from a hard reward. Environment, networks, replay and update
+are those of training, but the reward is the velocity along x in metres per second.
 """
 
 import argparse
@@ -33,7 +33,7 @@ def init(config: Config, key: jax.Array):
 
 
 def step(config: Config, carry, key: jax.Array):
-    """All envs once, then the gradient steps; also the mean forward velocity of the step."""
+    """Takes one vector step with its gradient steps; also returns the mean forward velocity."""
     p = components.make(config)
     learner, episodes, ring = carry
     key_act, key_env, key_sample, key_update = jax.random.split(key, 4)
@@ -63,8 +63,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--preset", default="quick")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=180.0, help="of training, compiled")
-    parser.add_argument("--toy", action="store_true", help="does it run? one segment of smoke")
+    parser.add_argument(
+        "--seconds", type=float, default=180.0, help="time of training, without compilation"
+    )
+    parser.add_argument(
+        "--toy", action="store_true", help="check that it runs: one segment of smoke"
+    )
     args = parser.parse_args()
     name, budget = ("smoke", 0.0) if args.toy else (args.preset, args.seconds)
     config = preset(name, random_baseline=False)

@@ -1,10 +1,10 @@
-"""What does XLA make of our programs for a GPU? Asked of its compiler, without one.
+"""How does XLA compile our programs for a GPU? Answered without a GPU.
 
-Needs `jax[cuda13]`, and no device: programs are compiled for an H100 as NVIDIA describes it. For
-each, the seconds that it took on this machine's cores, the memory that it wants beside its
-arguments, and how many kernels it launches, loops counted as often as they run. Kernels of this
-size are bound by their launch, 2 to 5 µs each: the number is the best prediction there is of what a
-step costs. Kernels are chosen without being timed (`--xla_gpu_autotune_level=0`).
+Needs `jax[cuda13]`, but no device: programs are compiled for an H100 as NVIDIA describes it. For
+each program it prints the compile time on this machine, the memory that it needs in addition to its
+arguments, and the number of kernel launches (a loop counts as often as it runs). Launches dominate
+kernels of this size, at 2 to 5 µs each, so their number is the best available prediction of what a
+step costs. Kernels are chosen without timing them (`--xla_gpu_autotune_level=0`).
 """
 
 import functools
@@ -15,8 +15,8 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-os.environ["JAX_SKIP_CUDA_CONSTRAINTS_CHECK"] = "1"  # of libraries that need a driver
-os.environ["JAX_PLATFORMS"] = "cpu"  # where what is no program runs
+os.environ["JAX_SKIP_CUDA_CONSTRAINTS_CHECK"] = "1"  # skips libraries that need a driver
+os.environ["JAX_PLATFORMS"] = "cpu"  # for all that runs outside the compiled programs
 os.environ["XLA_FLAGS"] = f"--xla_gpu_autotune_level=0 {os.environ.get('XLA_FLAGS', '')}"
 
 import jax
@@ -30,7 +30,7 @@ from maxent_jax.config import Config, preset
 from maxent_jax.density import knn
 from maxent_jax.envs import base
 
-# As XLA writes it of the device that it finds.
+# In the form in which XLA describes a device that it finds.
 H100 = """
 platform_name: "CUDA"
 device_description_str: "NVIDIA H100 80GB HBM3"
@@ -64,14 +64,14 @@ TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"\}')
 
 
 def compiled_for(device: Any, function: Callable, *args: Any) -> tuple[Any, float, float]:
-    """The program, and the seconds that it took to trace and to compile."""
+    """Returns the program, and the seconds to trace and to compile it."""
     mesh = jax.sharding.Mesh([device], ("devices",))
     here = NamedSharding(mesh, PartitionSpec())
     started = time.perf_counter()
     # The first argument is donated, as a run donates its state.
     donating = jax.jit(function, in_shardings=here, out_shardings=here, donate_argnums=0)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # where nothing of it can be reused
+        warnings.simplefilter("ignore")  # if none of it can be reused
         lowered = donating.lower(*args)
     traced = time.perf_counter()
     program = lowered.compile()
@@ -79,7 +79,7 @@ def compiled_for(device: Any, function: Callable, *args: Any) -> tuple[Any, floa
 
 
 def launches(text: str) -> tuple[int, int]:
-    """Kernels that a program launches, and those that are in it once; from its optimised HLO."""
+    """Counts a program's kernel launches, and its kernels, from its optimised HLO."""
     bodies: dict[str, list[str]] = {}
     entry = name = ""
     for line in text.splitlines():
@@ -106,7 +106,7 @@ def launches(text: str) -> tuple[int, int]:
             parts = [count(name) for name in names]
             trips = TRIPS.search(line)
             times = int(trips[1]) if trips else 1
-            if parts:  # of branches, the longest
+            if parts:  # the longest branch counts
                 total += times * max(part[0] for part in parts)
                 once += sum(part[1] for part in parts)
         return total, once
@@ -115,7 +115,7 @@ def launches(text: str) -> tuple[int, int]:
 
 
 def steps(name: str, num_envs: int, num_steps: int) -> tuple[Callable, tuple]:
-    """Random episodes in MJX with profile `fast`, as `benchmarks.gpu` measures them."""
+    """Returns random episodes in MJX with profile `fast`, as `benchmarks.gpu` measures them."""
     env = envs.make(name, "mjx", "fast")
     episodes = jax.eval_shape(lambda key: base.init(env, num_envs, 4096, key), jax.random.key(0))
 
@@ -141,7 +141,7 @@ def search(num_queries: int, num_points: int) -> tuple[Callable, tuple]:
 
 def main() -> None:
     flags = common.parser(__doc__)
-    flags.add_argument("--only", nargs="*", help="beginnings of the programs' names")
+    flags.add_argument("--only", nargs="*", help="beginnings of program names")
     args = flags.parse_args()
     try:
         chips = topologies.get_topology_desc("h100", "cuda", target_config=H100, topology="1x1x1")

@@ -1,8 +1,8 @@
-"""How many distances a second does the exact k-nearest-neighbour search make, and its peers?
+"""How many distances per second does the exact k-nearest-neighbour search make, and its peers?
 
-A tree looks at few of the pairs: its figure is the rate at which a search of all pairs would take
-as long. Queries and points are Gaussian or, with --run, states that the mixture of a run visits.
-Ours builds what it needs within each search; a peer's index is timed apart and in sum.
+A tree visits only few of the pairs, but its rate counts all of them. Queries and points are
+Gaussian; --run adds states that the mixture of a run visits. Our search includes all its
+preparation. A peer's index is timed separately, and a second rate includes it.
 """
 
 import itertools
@@ -22,10 +22,10 @@ from maxent_jax.runs import files
 
 NUM_NEIGHBORS, NUM_FEATURES = 3, 7  # k and p of the paper
 SIZES = ((64, 16_384), (4096, 65_536), (4096, 1_000_000))  # queries, points
-SCAN_PAIRS = 100_000_000  # roughly how many pairs a scan visits, in at least two steps
+SCAN_PAIRS = 100_000_000  # pairs in a scan, roughly; it has at least two steps
 MAX_SETS = 50  # of queries
-MATRIX_PAIRS = 300_000_000  # what stores all distances is measured up to here: 1.2 GB
-NUM_CHECKED = 64  # queries whose distances are held against float64
+MATRIX_PAIRS = 300_000_000  # the limit for searches that store all distances: 1.2 GB
+NUM_CHECKED = 64  # queries whose distances are compared with float64
 NUM_SEEDS = 4
 EPISODES = 20  # of each policy of a run, at a time
 
@@ -33,20 +33,20 @@ Search = Callable[[jax.Array, jax.Array], jax.Array]  # [B, F], [M, F] -> [B, k]
 
 
 class Problem(NamedTuple):
-    """Float32 on the host, where all peers but one take it from."""
+    """Float32 arrays on the host, from which all peers but one take them."""
 
     data: str
-    queries: np.ndarray  # [L, B, F]: a scan searches for a fresh set in each of its L steps
+    queries: np.ndarray  # [L, B, F]: a scan searches for another set in each of its L steps
     points: np.ndarray  # [M, F]
 
     @property
     def num_pairs(self) -> int:
-        """Of one set of queries."""
+        """Pairs of one set of queries and all points."""
         return self.queries.shape[1] * self.points.shape[0]
 
 
 class Measurement(NamedTuple):
-    """Of one set of queries."""
+    """The measurement of one set of queries."""
 
     seconds: float
     distances: np.ndarray  # [B, k]
@@ -62,7 +62,7 @@ def num_sets(num_queries: int, num_points: int) -> int:
 
 
 def make_problem(data: str, rows: np.ndarray, num_queries: int, num_points: int) -> Problem:
-    """From rows [L, F] in random order: the first are the queries, those behind them the points."""
+    """Makes a problem from rows [L, F] in random order: the first are queries, the last points."""
     sets = num_sets(num_queries, num_points)
     queries = rows[: sets * num_queries].reshape(sets, num_queries, NUM_FEATURES)
     return Problem(data, queries, rows[-num_points:])
@@ -73,7 +73,7 @@ def gaussian(num: int) -> np.ndarray:
 
 
 def visited(directory: Path, num: int) -> np.ndarray:
-    """Features [num, F] of states that the mixture of a run visits, in random order."""
+    """Returns features [num, F] of states that a run's mixture visits, in random order."""
     run = analysis.load_run(directory)
     found: list[np.ndarray] = []
     while sum(map(len, found)) < num:
@@ -88,17 +88,17 @@ def ours(queries: jax.Array, points: jax.Array) -> jax.Array:
 
 
 def in_xla(queries: jax.Array, points: jax.Array) -> jax.Array:
-    """Ours where there is no compiler."""
+    """Our search on machines without a compiler."""
     return by_blocks(NUM_NEIGHBORS, *_everyone(queries, points))
 
 
 def in_cuda(queries: jax.Array, points: jax.Array) -> jax.Array:
-    """Ours in CUDA, where it was built."""
+    """Our search in CUDA, if it was built."""
     return search_in_cuda(NUM_NEIGHBORS, *_everyone(queries, points))
 
 
 def top_k(queries: jax.Array, points: jax.Array) -> jax.Array:
-    """What one writes first: all squares at once, expanded, then `lax.top_k`."""
+    """The obvious search: all expanded squares at once, then `lax.top_k`."""
     query_squares = jnp.sum(queries**2, axis=1)[:, None]
     squared = query_squares - 2 * queries @ points.T + jnp.sum(points**2, axis=1)[None, :]
     nearest, _ = jax.lax.top_k(-squared, NUM_NEIGHBORS)
@@ -106,7 +106,7 @@ def top_k(queries: jax.Array, points: jax.Array) -> jax.Array:
 
 
 def _everyone(queries, points):
-    """The arguments of a form that excludes nobody."""
+    """The arguments of a search that excludes no point."""
     exclude = jnp.full(len(queries), -1, jnp.int32)
     labels = jnp.arange(len(points), dtype=jnp.int32)
     return queries, points, exclude, labels, jnp.int32(len(points))
@@ -121,7 +121,7 @@ def alone(search: Search, problem: Problem, repeats: int) -> Measurement:
 
 
 def in_scan(search: Search, problem: Problem, repeats: int) -> Measurement:
-    """As training uses it: inside a larger program, for fresh queries at each step."""
+    """Measures a search as in training: in a larger program, with other queries at each step."""
     queries, points = jnp.asarray(problem.queries), jnp.asarray(problem.points)
 
     def scan(queries, points):
@@ -135,9 +135,7 @@ def in_scan(search: Search, problem: Problem, repeats: int) -> Measurement:
 
 
 def vmapped(search: Search, problem: Problem, repeats: int) -> Measurement:
-    """As seeds side by side use it: each with its own queries and points. Held against as many
-    single searches.
-    """
+    """Measures searches of several seeds in parallel, compared with as many single searches."""
     shift = jnp.arange(NUM_SEEDS, dtype=jnp.float32)[:, None, None]
     queries, points = (jnp.asarray(x) + shift for x in (problem.queries[0], problem.points))
     together, _ = common.compiled(jax.vmap(search), queries, points)
@@ -153,7 +151,7 @@ def vmapped(search: Search, problem: Problem, repeats: int) -> Measurement:
 def prebuilt(
     build: Callable[[], Any], search: Callable[[Any], np.ndarray], problem: Problem, repeats: int
 ) -> Measurement:
-    """A peer that puts the points into an index first; both parts timed, apart."""
+    """Measures a peer that first builds an index of the points; times both separately."""
     build_seconds = common.median_seconds(build, repeats)
     index = build()
     seconds = common.median_seconds(lambda: search(index), repeats)
@@ -210,7 +208,7 @@ PEERS = (
 
 
 def exact(problem: Problem) -> np.ndarray:
-    """[NUM_CHECKED, k] distances in float64."""
+    """Returns the distances [NUM_CHECKED, k] in float64."""
     points = problem.points.astype(np.float64)
     queries = problem.queries[0, :NUM_CHECKED].astype(np.float64)
     squared = np.stack([np.sum((points - query) ** 2, axis=1) for query in queries])
@@ -218,13 +216,13 @@ def exact(problem: Problem) -> np.ndarray:
 
 
 def measure(problem: Problem, peers, repeats: int) -> Iterator[dict[str, Any]]:
-    """One row for each searcher and form; a peer on the host is held against ours alone."""
+    """Yields a row for each search and form; peers on the host are compared with ours alone."""
     truth = exact(problem)
     our_seconds: dict[str, float] = {}  # by form
 
     def row(who: str, form: str, found: Measurement) -> dict[str, Any]:
         our_seconds.setdefault(form, found.seconds)
-        # A state that the points hold too is at distance 0, for all.
+        # The distance is 0 if the query is also one of the points.
         error = np.abs(found.distances[:NUM_CHECKED] - truth) / np.maximum(truth, 1e-6)
         with_build = {}
         if "build_seconds" in found.extra:
@@ -261,7 +259,7 @@ def measure(problem: Problem, peers, repeats: int) -> Iterator[dict[str, Any]]:
 
 def main() -> None:
     flags = common.parser(__doc__)
-    flags.add_argument("--run", type=Path, help="a run's directory, for states as they occur")
+    flags.add_argument("--run", type=Path, help="a run's directory: also search its states")
     args = flags.parse_args()
     try:
         if args.run is not None:

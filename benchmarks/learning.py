@@ -1,7 +1,7 @@
-"""Which regime takes Ant farthest? Preset `quick` with one thing changed at a time.
+"""Which settings take Ant farthest? Preset `quick` with one change at a time.
 
-Each run is the command `train` in a process of its own with its share of the cores; its row joins
-the file given by --out as soon as it ends, and a row that is there is not made again.
+Each run is the command `train` in its own process, with its share of the cores. As soon as it ends,
+its row is written to the file given by --out. Runs whose row is already there are skipped.
 """
 
 import json
@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from benchmarks import common
 from maxent_jax.runs import files
 
-# What each regime changes of the preset.
+# The changes of each regime to the preset.
 REGIMES: dict[str, dict[str, Any]] = {
     "quick": {},
     "one-step returns": {"return_steps": 1},
@@ -91,7 +91,7 @@ KEPT = (
 
 
 def run(name: str, seed: int, base: dict[str, Any], cores: set[int]) -> dict[str, Any]:
-    """A row: what the run reached after each iteration."""
+    """Runs a regime and returns its row, with the results after each iteration."""
     flags: list[str] = []
     for field, value in (REGIMES[name] | base | {"seed": seed}).items():
         flag = field.replace("_", "-")
@@ -106,7 +106,7 @@ def run(name: str, seed: int, base: dict[str, Any], cores: set[int]) -> dict[str
             stderr=subprocess.PIPE,
             text=True,
         )
-        if hasattr(os, "sched_setaffinity"):  # before its threads start, which inherit it
+        if hasattr(os, "sched_setaffinity"):  # threads that start later inherit it
             os.sched_setaffinity(process.pid, cores)
         _, errors = process.communicate()
         if process.returncode != 0:
@@ -118,7 +118,7 @@ def run(name: str, seed: int, base: dict[str, Any], cores: set[int]) -> dict[str
 
 
 def study(names, seeds, base, jobs: int, out: Path) -> Iterator[dict[str, Any]]:
-    """Rows as they end, `jobs` runs side by side; each is in the file before it is yielded."""
+    """Yields rows as runs end, `jobs` runs in parallel; writes each row before it yields it."""
     kept = (
         json.loads(out.read_text(encoding="utf-8")) if out.exists() else {"base": base, "rows": []}
     )
@@ -156,11 +156,11 @@ def study(names, seeds, base, jobs: int, out: Path) -> Iterator[dict[str, Any]]:
             files.write_json(out, {"base": base, "rows": done})
             yield row
     if failed:
-        raise RuntimeError(f"{failed} runs failed; the others are in {out}")
+        raise RuntimeError(f"{failed} runs failed; the rows of the others are in {out}")
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Cells after the last iteration, a dot for each seed, best regime on top; and their curves."""
+    """Draws the cells after the last iteration, a dot per seed, best regime on top; and curves."""
     regimes = {row["regime"] for row in rows}
     of_regime = {name: [r for r in rows if r["regime"] == name] for name in regimes}
     ranked = sorted(
@@ -188,8 +188,8 @@ def main() -> None:
     flags = common.parser(__doc__)
     flags.add_argument("--regimes", nargs="*", choices=list(REGIMES), default=list(REGIMES))
     flags.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
-    flags.add_argument("--iterations", type=int, help="of each run; the preset's where left out")
-    flags.add_argument("--jobs", type=int, default=common.CORES, help="runs side by side")
+    flags.add_argument("--iterations", type=int, help="of each run; the preset's by default")
+    flags.add_argument("--jobs", type=int, default=common.CORES, help="number of parallel runs")
     flags.add_argument("--out", type=Path, default=Path("results/learning.json"))
     args = flags.parse_args()
     common.print_versions()

@@ -1,10 +1,10 @@
-"""What does each simplification of the physics gain in MJX, and what does it cost in fidelity?
+"""How much faster is each simplification of the physics in MJX, and how much fidelity does it cost?
 
-Each row changes some options of an environment's XML (envs.physics.Options). Its motion is held
-against C MuJoCo with the XML unchanged, from the same settled states under the same random actions.
-Beside the drift: how deep contacts sink in, how long random episodes last, how many states are
-upside down. With --learner, one iteration of preset `quick` is trained on each physics instead (on
-C MuJoCo, which moves alike at equal options and is faster on a CPU).
+Each row changes some options of an environment's XML (envs.physics.Options). Its motion is compared
+with C MuJoCo and the unchanged XML, from the same settled states under the same random actions. In
+addition to the drift, it reports the depth of contacts, the length of random episodes and the share
+of states upside down. With --learner, one iteration of preset `quick` is trained on each physics
+instead. This uses C MuJoCo, which moves alike at equal options and is faster on a CPU.
 """
 
 import functools
@@ -36,7 +36,7 @@ def _options(integrator: str | None, iterations: int, ls_iterations: int, **more
     return Options(integrator, iterations=iterations, ls_iterations=ls_iterations, **more)
 
 
-# The floor: what is fast and coarse; to be beaten in fidelity at its speed.
+# The baseline is fast and coarse: others should have higher fidelity at its speed.
 FLOOR = _options("Euler", 1, 4, eulerdamp=False)
 OPTIONS: dict[str, dict[str, Options]] = {
     "ant": {
@@ -92,9 +92,9 @@ OPTIONS: dict[str, dict[str, Options]] = {
 
 
 def motion(env: MujocoEnv, starts: Any, actions: np.ndarray) -> dict[str, Any]:
-    """Positions and observations [T, N, ...] under the actions, and how fast they were made.
+    """Returns positions and observations [T, N, ...] under the actions, and the step rate.
 
-    The steps run in chunks, of which the median is timed.
+    The steps run in chunks; the rate is from the median time of a chunk.
     """
     chunks = jnp.asarray(actions).reshape(-1, min(CHUNK, len(actions)), *actions.shape[1:])
     program, compile_seconds = common.compiled(functools.partial(scan, env), starts, chunks[0])
@@ -113,7 +113,7 @@ def motion(env: MujocoEnv, starts: Any, actions: np.ndarray) -> dict[str, Any]:
 
 
 def fidelity(env: MujocoEnv, found: dict[str, Any], truth: dict[str, Any]) -> dict[str, float]:
-    """Drift of the torso, and what random episodes are like."""
+    """Returns the drift of the torso, and measures of random episodes."""
     torso = 2 if env.task.torso is None else 3
     away = np.linalg.norm((found["positions"] - truth["positions"])[..., :torso], axis=-1)
     steps = [n for n in DRIFT_STEPS if n <= len(away)]
@@ -131,7 +131,7 @@ def fidelity(env: MujocoEnv, found: dict[str, Any], truth: dict[str, Any]) -> di
 
 
 def penetration(model: mujoco.MjModel, positions: np.ndarray) -> np.ndarray:
-    """Metres: how deep the deepest contact with the ground is, in each state that has one."""
+    """Returns the depth of the deepest contact with the ground, in metres, by state with one."""
     data, depths = mujoco.MjData(model), []
     for qpos in positions[:1000]:
         data.qpos[:] = qpos
@@ -143,7 +143,7 @@ def penetration(model: mujoco.MjModel, positions: np.ndarray) -> np.ndarray:
 
 
 def measure(name: str, num_envs: int, num_steps: int) -> Iterator[dict[str, Any]]:
-    """A row for each set of options."""
+    """Yields a row for each set of options."""
     task = envs.TASKS[name]
     truth_env = MujocoEnv(task, "mujoco")
     starts, actions = settled(truth_env, num_envs, num_steps, SEED)
@@ -170,7 +170,7 @@ def measure(name: str, num_envs: int, num_steps: int) -> Iterator[dict[str, Any]
 
 
 def survive(name: str, num_steps: int, num_envs: int) -> dict[str, Any]:
-    """Full-scale random actions in MJX with profile `fast`: does a NaN get through?"""
+    """Checks that no NaN gets through under full-scale random actions, in MJX with `fast`."""
     env = envs.make(name, "mjx", "fast")
     key_init, key_steps = jax.random.split(jax.random.key(SEED))
 
@@ -201,11 +201,11 @@ def survive(name: str, num_steps: int, num_envs: int) -> dict[str, Any]:
 
 
 def learn(name: str, label: str, seed: int) -> dict[str, Any]:
-    """One iteration of preset `quick` on a physics; the mixture is played there too."""
+    """Trains one iteration of preset `quick` on a physics, and plays the mixture on it."""
     row, task = registry.ENVIRONMENTS[name], envs.TASKS[name]._replace(fast=OPTIONS[name][label])
     registry.ENVIRONMENTS[name] = row._replace(entry=entries.of_task(task))
     components._make.cache_clear()
-    jax.clear_caches()  # which know the environment by its name
+    jax.clear_caches()  # they identify the environment by its name
     config = preset("quick", env=name, physics="fast", backend="mujoco", seed=seed)
     started = time.perf_counter()
     programs = algorithm.programs(config)
@@ -229,7 +229,7 @@ def main() -> None:
     flags.add_argument("--env", nargs="*", choices=list(OPTIONS), default=list(OPTIONS))
     flags.add_argument("--envs", type=int, default=64)
     flags.add_argument("--only", nargs="*", help="labels of options")
-    flags.add_argument("--survive", type=int, help="random env steps with profile fast, no drift")
+    flags.add_argument("--survive", type=int, help="only random env steps, this many, with `fast`")
     flags.add_argument("--learner", type=int, nargs="*", help="seeds to train on each physics")
     args = flags.parse_args()
     runtime.prepare(simulates_in_jax=True)

@@ -1,6 +1,6 @@
-"""How large is the replay, and what does it cost to insert once it is full, or to draw?
+"""How large is the replay, and how long do inserting into a full one and drawing take?
 
-The usual buffer keeps both observations of each transition: twice the memory.
+The usual buffer stores both observations of each transition, which takes twice the memory.
 """
 
 import functools
@@ -25,18 +25,18 @@ NUM_INSERTS = 100
 
 
 def num_bytes(tree: Any) -> int:
-    """Of all its arrays."""
+    """Returns the bytes of all arrays of a tree."""
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
 def both_observations(config: Config) -> int:
-    """Bytes of a float32 buffer of observation, action, reward, next observation and done flag."""
+    """Returns the bytes of a buffer of both observations, action, reward and flag in float32."""
     sac = components.make(config).sac
     return 4 * config.learner.replay_size * (2 * sac.observation_size + sac.action_size + 2)
 
 
 def ring_of(config: Config, full: bool) -> Replay:
-    """Empty, or as if every environment had gone on for as long as the ring is, without an end."""
+    """Returns an empty replay, or one that is full of a single long episode per environment."""
     ring = experience.init(components.make(config))
     if not full:
         return ring
@@ -50,7 +50,7 @@ def ring_of(config: Config, full: bool) -> Replay:
 
 
 def insert_seconds(config: Config, full: bool, repeats: int) -> float:
-    """Of one step of all envs, in a donated scan; the search of its distances included."""
+    """Returns the time of one vector step in a donated scan, with the search of its distances."""
     p = components.make(config)
     n, sac = config.budget.num_envs, p.sac
     state = jnp.ones((n, sac.observation_size))
@@ -87,7 +87,7 @@ def insert_seconds(config: Config, full: bool, repeats: int) -> float:
 
 
 def sample_seconds(config: Config, repeats: int) -> float:
-    """Of drawing one batch from a full replay."""
+    """Returns the time to draw one batch from a full replay."""
     p = components.make(config)
     starts = jnp.ones((config.environment.num_starts, p.sac.observation_size))
     ring = ring_of(config, full=True)
@@ -96,7 +96,7 @@ def sample_seconds(config: Config, repeats: int) -> float:
 
 
 def measure(env: str, capacity: int, repeats: int) -> Iterator[dict[str, Any]]:
-    """A row for each width of the states."""
+    """Yields a row for each dtype of the states."""
     for dtype in ("float32", "float16"):
         settings = {"replay_size": capacity, "replay_dtype": dtype, "yaw_copies": 0}
         config = preset("quick", env=env, **settings)

@@ -1,8 +1,8 @@
-"""How many SAC updates a second, what share of the machine's matmul peak is that, and the peers?
+"""How many SAC updates per second, what share of the matmul peak is that, and how fast are peers?
 
-Updates run in one scan, each on a batch of its own of Ant's sizes. Peers run their own `train` on
-their own replay, from which they also draw the batches. The whole loop steps Ant too, on C MuJoCo:
-ours is a segment of MaxEnt-V with the reward measured and paid, theirs is `learn`.
+Updates run in one scan, each on its own batch of Ant's sizes. Peers run their own `train` and draw
+the batches from their own replay. The whole loop also steps Ant on C MuJoCo: ours is a segment of
+MaxEnt-V with its reward, theirs is `learn`.
 """
 
 import functools
@@ -31,18 +31,18 @@ LOOP_STEPS = 640
 
 
 def peak_flops(size: int, repeats: int) -> float:
-    """FLOP/s of one square float32 matmul at the precision that the networks' layers have."""
+    """Measures FLOP/s of a square float32 matmul at the precision of the networks' layers."""
     a = jnp.ones((size, size))
     product, _ = common.compiled(jnp.matmul, a, a)
     return 2 * size**3 / common.median_seconds(lambda: product(a, a), repeats)
 
 
 def update_flops(hidden_size: int, batch_size: int) -> float:
-    """Of the matmuls that one update cannot do without.
+    """Counts the FLOP of the matmuls that one update needs.
 
-    A layer of m inputs and n outputs costs 2 m n a row forward, as much again for the gradient of
-    its weights, and as much for that of its inputs, which a first layer is not asked for. XLA's own
-    count, of everything, is 5 % higher for 128 units and a batch of 128, 3 % for 256 and 256.
+    A layer of m inputs and n outputs costs 2 m n per row forward, as much for the gradient of its
+    weights, and as much for the gradient of its inputs, which a first layer does not need. XLA
+    counts everything: 5 % more for 128 units and a batch of 128, 3 % more for 256 and 256.
     """
 
     def forward(num_inputs, num_outputs):
@@ -55,7 +55,7 @@ def update_flops(hidden_size: int, batch_size: int) -> float:
     observation_share = OBSERVATION_SIZE / (OBSERVATION_SIZE + ACTION_SIZE)
     target = actor + 2 * critic
     critic_step = 2 * (3 * critic - critic_first)
-    # Through both critics to the action: no gradient of their weights, none of the observation.
+    # Through both critics to the action, without gradients of weights or observation.
     through_critics = 2 * (2 * critic - critic_first * observation_share)
     actor_step = 3 * actor - actor_first + through_critics
     return float(batch_size * (target + critic_step + actor_step))
@@ -64,7 +64,7 @@ def update_flops(hidden_size: int, batch_size: int) -> float:
 def many_updates(
     hidden_size: int, batch_size: int, layer_norm: bool, num_seeds: int, num_updates: int
 ) -> tuple[Callable, tuple[Any, Any]]:
-    """A function that makes that many updates of each seed, and what it takes."""
+    """Returns a function that makes `num_updates` updates of each seed, and its arguments."""
     config = preset(
         "paper",
         hidden_layers=NUM_HIDDEN_LAYERS,
@@ -100,7 +100,7 @@ def many_updates(
 def ours(
     hidden_size: int, batch_size: int, layer_norm: bool, num_seeds: int, num_updates: int, repeats
 ) -> tuple[float, float]:
-    """Updates a second, all seeds together, and seconds to compile."""
+    """Returns updates per second of all seeds together, and the seconds to compile."""
     run, inputs = many_updates(hidden_size, batch_size, layer_norm, num_seeds, num_updates)
     program, compile_seconds = common.compiled(run, *inputs)
     seconds = common.median_seconds(lambda: program(*inputs), repeats)
@@ -108,13 +108,13 @@ def ours(
 
 
 class Loop(NamedTuple):
-    """How a whole loop alternates."""
+    """The sizes of a whole loop."""
 
     num_envs: int
     updates_per_step: float
 
 
-# One environment as the peers are used by default, several at the same ratio, and quick's own.
+# One environment as in the peers' defaults, several at the same ratio, and quick's own ratio.
 _QUICK = preset("quick")
 LOOPS = (
     Loop(1, 1.0),
@@ -124,14 +124,14 @@ LOOPS = (
 
 
 class Noise(gymnasium.Env):
-    """Nothing but spaces of Ant's sizes, from which a peer makes its networks."""
+    """Spaces of Ant's sizes, from which a peer makes its networks."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
 
 
 def baselines(module, hidden_size: int, batch_size: int, num_updates: int, repeats: int) -> float:
-    """Updates a second of stable-baselines3 or of sbx, which has the same interface."""
+    """Measures updates per second of stable-baselines3, or of sbx, which has the same interface."""
     from stable_baselines3.common import logger
 
     model = module.SAC(
@@ -154,7 +154,7 @@ def baselines(module, hidden_size: int, batch_size: int, num_updates: int, repea
 
 
 def our_loop(hidden_size: int, batch_size: int, loop: Loop, steps: int, repeats: int) -> float:
-    """Env steps a second of training on Ant."""
+    """Measures env steps per second of our training on Ant."""
     config = preset(
         "quick",
         hidden_size=hidden_size,
@@ -165,7 +165,7 @@ def our_loop(hidden_size: int, batch_size: int, loop: Loop, steps: int, repeats:
         num_segments=1,
         replay_size=100_000,
         random_baseline=False,
-        # the peers' networks and targets
+        # as in the peers' networks and targets
         critic_layer_norm=False,
         return_steps=1,
         yaw_copies=0,
@@ -176,11 +176,11 @@ def our_loop(hidden_size: int, batch_size: int, loop: Loop, steps: int, repeats:
 def their_loop(
     module, hidden_size: int, batch_size: int, loop: Loop, steps: int, repeats: int
 ) -> float:
-    """Env steps a second of `learn` on Gymnasium's Ant, the same number of environments."""
+    """Measures env steps per second of `learn` on as many environments of Gymnasium's Ant."""
     from stable_baselines3.common.env_util import make_vec_env
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Gymnasium's, that v4 is out of date
+        warnings.simplefilter("ignore")  # Gymnasium warns that v4 is out of date
         envs = make_vec_env("Ant-v4", n_envs=loop.num_envs)
     model = module.SAC(
         "MlpPolicy",
@@ -193,7 +193,7 @@ def their_loop(
         policy_kwargs={"net_arch": [hidden_size] * NUM_HIDDEN_LAYERS},
         device="cpu",
     )
-    model.learn(steps)  # compiles, and fills the replay
+    model.learn(steps)  # compiles and fills the replay
     run = lambda: model.learn(steps, reset_num_timesteps=False)
     return steps / common.median_seconds(run, repeats)
 
@@ -207,7 +207,7 @@ PEERS = (
 def measure(
     size: tuple[int, int], num_updates: int, peak: float, peers, repeats: int
 ) -> Iterator[dict[str, Any]]:
-    """Rows for one size; ratios are to one seed of ours without layer norm, measured first."""
+    """Yields rows for one size; ratios are to our first row, one seed without layer norm."""
     hidden_size, batch_size = size
     rates: list[float] = []
 
@@ -241,7 +241,7 @@ def measure(
 def measure_loops(
     size: tuple[int, int], loops, steps: int, peers, repeats: int
 ) -> Iterator[dict[str, Any]]:
-    """Rows for one size; ratios are to ours in the same loop."""
+    """Yields rows for one size; ratios are to ours in the same loop."""
     hidden_size, batch_size = size
     for loop in loops:
         sizes = hidden_size, batch_size, loop, steps, repeats

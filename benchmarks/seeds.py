@@ -1,7 +1,7 @@
-"""How many env steps a second does training make with several seeds side by side?
+"""How many env steps per second does training make with several seeds in parallel?
 
-A segment of a preset on Ant, gradient steps and reward included, for all seeds as one program.
-One seed stands for as many runs, one after another.
+It times a segment of a preset on Ant, with gradient steps and reward, for all seeds as one program.
+The rate of one seed is that of runs one after another.
 """
 
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from maxent_jax.runs import runtime
 
 
 def seconds_per_segment(config, repeats: int) -> float:
-    """Median, after one segment to warm up; the state is donated, so that each goes on."""
+    """Returns the median time of a segment, after one to warm up; each continues the last."""
     programs = algorithm.programs(config)
     state, _ = programs.begin(algorithm.start(config))
 
@@ -29,7 +29,7 @@ def seconds_per_segment(config, repeats: int) -> float:
 
 
 def measure(name: str, settings: dict[str, Any], counts, repeats: int) -> Iterator[dict[str, Any]]:
-    """A row for each number of seeds; the first is what the others are held against."""
+    """Yields a row for each number of seeds; the others are compared with the first."""
     first = 0.0
     for count in counts:
         config = preset(name, num_seeds=count, **settings)
@@ -54,8 +54,8 @@ def main() -> None:
     flags.add_argument("--env", choices=ENVS, default="ant")
     flags.add_argument("--backend", choices=BACKENDS, default="auto")
     flags.add_argument("--preset", choices=list(PRESETS), default="quick")
-    flags.add_argument("--num-envs", type=int, help="of a seed; the preset's where left out")
-    flags.add_argument("--batch-size", type=int, help="of a seed; the preset's where left out")
+    flags.add_argument("--num-envs", type=int, help="of a seed; the preset's by default")
+    flags.add_argument("--batch-size", type=int, help="of a seed; the preset's by default")
     flags.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 4, 8])
     args = flags.parse_args()
     runtime.prepare(simulates_in_jax=args.backend == "mjx")

@@ -1,4 +1,4 @@
-"""Entry point: maxent_jax/commands/evaluate.py has what it does."""
+"""Entry point of `python -m experiments.evaluate`: see maxent_jax/commands/evaluate.py."""
 
 from maxent_jax.commands import cli
 

@@ -1,8 +1,8 @@
-"""Makes the feature table of an environment: coordinates kept, and projections of the rest.
+"""Makes the feature table of an environment: kept coordinates, and projections of the rest.
 
 Projections are divided by their largest magnitude over 10,000 steps of a uniformly random policy,
-on C MuJoCo with Gymnasium's options, so that no backend and no run changes the space in which
-densities are measured. The classic environments have few enough coordinates to keep all.
+on C MuJoCo with Gymnasium's options, so the space in which densities are measured depends on no
+backend and on no run. The classic environments keep all their few coordinates.
 """
 
 import argparse
@@ -12,12 +12,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
-import maxent_jax
 from maxent_jax import envs, features
 from maxent_jax.envs import base
 
 NUM_ENVS, VECTOR_STEPS, SEED = 10, 1000, 0
-# What is kept of the state: name, and how much of it counts as 1.
+# The coordinates kept from the state: name, and the value that counts as 1.
 KEPT = {
     "ant": {"x": 1.0, "y": 1.0},
     "walker2d": {"x": 1.0, "z": 1.0},
@@ -28,7 +27,7 @@ KEPT = {
 
 
 def measure(name: str) -> dict:
-    """The table as JSON-ready data."""
+    """Returns the table as JSON-ready data."""
     env = envs.make(name)
     kept = list(range(len(KEPT[name])))  # the first coordinates of the state
     if len(kept) == env.observation_size:
@@ -48,7 +47,7 @@ def measure(name: str) -> dict:
 
 
 def _random_states(name: str) -> np.ndarray:
-    """[10,000, D] float64."""
+    """States [10,000, D] of a random policy, float64."""
     env = envs.make(name, backend="mujoco")
     key_init, key_steps = jax.random.split(jax.random.key(SEED))
     episodes = base.init(env, NUM_ENVS, 1000, key_init)
@@ -67,7 +66,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", choices=sorted(KEPT), required=True)
     name = parser.parse_args().env
-    path = Path(maxent_jax.__file__).parent / "tables" / f"features_{name}.json"
+    path = Path(envs.__file__).parent / "tables" / f"features_{name}.json"
     path.write_text(json.dumps(measure(name), indent=1) + "\n", encoding="utf-8")
     print(f"wrote {path.name}")
 

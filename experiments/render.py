@@ -1,4 +1,4 @@
-"""Entry point: maxent_jax/commands/render.py has what it does."""
+"""Entry point of `python -m experiments.render`: see maxent_jax/commands/render.py."""
 
 from maxent_jax.commands import cli
 

@@ -1,4 +1,4 @@
-"""Entry point: maxent_jax/commands/report.py has what it does."""
+"""Entry point of `python -m experiments.report`: see maxent_jax/commands/report.py."""
 
 from maxent_jax.commands import cli
 

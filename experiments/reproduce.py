@@ -1,4 +1,4 @@
-"""Entry point: maxent_jax/commands/reproduce.py has what it does."""
+"""Entry point of `python -m experiments.reproduce`: see maxent_jax/commands/reproduce.py."""
 
 from maxent_jax.commands import cli
 

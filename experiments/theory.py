@@ -1,4 +1,4 @@
-"""Entry point: maxent_jax/commands/theory.py has what it does."""
+"""Entry point of `python -m experiments.theory`: see maxent_jax/commands/theory.py."""
 
 from maxent_jax.commands import cli
 

@@ -1,4 +1,4 @@
-"""Entry point: maxent_jax/commands/train.py has what it does."""
+"""Entry point of `python -m experiments.train`: see maxent_jax/commands/train.py."""
 
 from maxent_jax.commands import cli
 

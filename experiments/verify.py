@@ -1,4 +1,4 @@
-"""Entry point: maxent_jax/commands/verify.py has what it does."""
+"""Entry point of `python -m experiments.verify`: see maxent_jax/commands/verify.py."""
 
 from maxent_jax.commands import cli
 

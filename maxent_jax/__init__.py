@@ -1,6 +1,6 @@
-"""Exploration by maximum state entropy, on accelerators. See README.md for the tour.
+"""Exploration by maximum state entropy, on accelerators. See README.md for an overview.
 
-Importing the package loads no array library, so that a command line can reject bad input at once;
+Importing the package loads no array library, so a command line can reject bad input at once.
 `load_run` and the modules load it when they are used.
 """
 

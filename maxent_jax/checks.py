@@ -11,11 +11,11 @@ from maxent_jax.errors import ConfigError
 
 
 def check_whole(name: str, value: Any, least: int | None = None) -> int:
-    """The value as an int.
+    """Returns the value as an int.
 
     Raises:
-      TypeError: it is no whole number.
-      ValueError: it is below the least.
+      TypeError: the value is not a whole number.
+      ValueError: the value is below `least`.
     """
     try:
         if isinstance(value, bool):
@@ -29,10 +29,10 @@ def check_whole(name: str, value: Any, least: int | None = None) -> int:
 
 
 def check_number(name: str, value: Any) -> float:
-    """The value as a float.
+    """Returns the value as a float.
 
     Raises:
-      TypeError: it is no real number.
+      TypeError: the value is not a real number.
     """
     try:
         if isinstance(value, str | bytes | bool):
@@ -43,10 +43,10 @@ def check_number(name: str, value: Any) -> float:
 
 
 def check_path(name: str, value: Any) -> Path:
-    """The value as a Path.
+    """Returns the value as a Path.
 
     Raises:
-      TypeError: it is neither a string nor a path.
+      TypeError: the value is neither a string nor a path.
     """
     if not isinstance(value, str | os.PathLike):
         raise TypeError(f"{name} is {value!r}, but must be a string or a pathlib.Path")
@@ -54,7 +54,7 @@ def check_path(name: str, value: Any) -> Path:
 
 
 def check_choice(what: str, value: str, known: Collection[str]) -> None:
-    """Raises ConfigError unless the value is among the known ones; it names the nearest."""
+    """Raises ConfigError, which names the closest match, unless the value is known."""
     if isinstance(value, str) and value in known:
         return
     shown = f"'{value[:80]}'" if isinstance(value, str) else repr(value)[:80]

@@ -1,4 +1,4 @@
-"""What a config makes once, and every step uses: the environment, the learner's fixed half, phi."""
+"""The components of a config: what it makes once and every step uses."""
 
 import functools
 from typing import Any, NamedTuple
@@ -19,26 +19,26 @@ from maxent_jax.types import Features
 
 
 class Components(NamedTuple):
-    """Static: nothing here changes in a run, or depends on a config's data fields."""
+    """Static: no component changes during a run or depends on a config's data fields."""
 
     config: Config
     env: Env
     grid: Grid
     torso: Torso | None
-    num_seen: int  # entries of a state, the first ones, that the networks see
+    num_seen: int  # the networks see this many entries of a state, from the first
     sac: agent.Sac
     phi: Features
     bonus: Bonus | None = None
 
 
 def make(config: Config) -> Components:
-    """The components of the config's program, made once for each program."""
+    """Returns the components of the config's program; each program makes them once."""
     return _make(config.program())
 
 
 @functools.lru_cache(maxsize=8)
 def _make(config: Config) -> Components:
-    with jax.ensure_compile_time_eval():  # may be called first while something is being traced
+    with jax.ensure_compile_time_eval():  # the first call may come during a trace
         entry = envs.entry(config.env)
         deviations: dict[str, Any] = {}
         if registry.environment(config.env).is_robot:
@@ -66,7 +66,7 @@ def _make(config: Config) -> Components:
 
 
 def _units(config: Config, grid: Grid, num_features: int) -> jax.Array:
-    """[F] what counts as 1 to a bonus: an eighth of the grid's side where features are metres."""
+    """[F] the units of a bonus: an eighth of the grid's side for features in metres, else 1."""
     sides = [1.0, 1.0]
     if registry.environment(config.env).in_metres:
         sides = [(high - low) / 8 for low, high in zip(grid.low, grid.high, strict=True)]

@@ -1,4 +1,4 @@
-"""Errors that a user can meet. Each message is one sentence: what is wrong, and what to do.
+"""Errors that a user can see. Each message is one sentence: what is wrong, and what to do.
 
 Loads no array library.
 """
@@ -9,7 +9,7 @@ class UsageError(ValueError):
 
 
 class ConfigError(ValueError):
-    """A setting has a value that no run can have."""
+    """A setting has an invalid value."""
 
 
 class ConfigTypeError(ConfigError, TypeError):
@@ -17,7 +17,7 @@ class ConfigTypeError(ConfigError, TypeError):
 
 
 class RunError(ValueError):
-    """A directory is not the run that it is taken for."""
+    """A directory does not hold the expected run."""
 
 
 class CheckpointError(RunError):
@@ -33,4 +33,4 @@ class SaveError(RuntimeError):
 
 
 class NonFiniteError(RuntimeError):
-    """Training produced a number that is not finite; nothing of it was saved."""
+    """Training produced a number that is not finite; that state was not saved."""

@@ -1,7 +1,8 @@
-"""phi(s): the space in which densities are measured. Coordinates, and five projections of the rest.
+"""The feature map phi(s): some coordinates of the state, and five projections of the rest.
 
-The map of an environment is fixed by a small table, shared by all methods and seeds;
-`python -m experiments.measure_features` makes it. One without a table has a default map.
+Densities are measured in the space of features. A small table fixes the map of an environment for
+all methods and seeds; `python -m experiments.measure_features` makes it. An environment without a
+table has a default map.
 """
 
 import dataclasses
@@ -23,19 +24,19 @@ PROJECTION_SEED = 20_240_501
 
 @dataclasses.dataclass(frozen=True)
 class FeatureMap:
-    """phi(s[..., D]) -> [..., F] float32; F is 7 for Gymnasium's robots."""
+    """A feature map, [..., D] -> [..., F] float32; F is 7 for Gymnasium's robots."""
 
-    coordinates: tuple[int, ...]  # of the state, kept
-    units: tuple[float, ...]  # what counts as 1 of each; 1 where they are metres
-    projection: tuple[tuple[float, ...], ...]  # [D - coordinates, 5 or 0], order 1 each
+    coordinates: tuple[int, ...]  # indices of the entries that are kept
+    units: tuple[float, ...]  # what each is divided by; 1 for metres
+    projection: tuple[tuple[float, ...], ...]  # [D - coordinates, 5 or 0]; results are of order 1
     names: tuple[str, ...]
 
     @in_32_bits
     def __call__(self, observation: jax.Array) -> jax.Array:
-        """[..., D] -> [..., F].
+        """Returns the features [..., F] of states [..., D].
 
         Raises:
-          ValueError: another D than that of the environment.
+          ValueError: D is not that of the environment.
         """
         observation = jnp.asarray(observation, jnp.float32)
         size = len(self.coordinates) + len(self.projection)
@@ -49,25 +50,25 @@ class FeatureMap:
         projected = jnp.matmul(
             rest,
             jnp.array(self.projection, jnp.float32),
-            precision=jax.lax.Precision.HIGHEST,  # not TF32: distances are measured in it
+            precision=jax.lax.Precision.HIGHEST,  # not TF32: features serve to measure distances
         )
         return jnp.concatenate([kept, projected], axis=-1)
 
 
 def raw_projection(num_inputs: int) -> np.ndarray:
-    """[num_inputs, 5] float64 standard normal, the same for every run. Source: the paper's §5.1."""
+    """Returns [num_inputs, 5] float64 standard normal, always the same. Source: the paper, §5.1."""
     generator = np.random.default_rng(PROJECTION_SEED)
     return generator.standard_normal((num_inputs, NUM_PROJECTIONS))
 
 
 def make_feature_map(env_name: str) -> Features:
-    """The feature map of an environment: its own, or that of its table, or the default one.
+    """Returns the feature map of an environment: its own, else its table's, else the default.
 
-    The default keeps the first two observations, and projects the others so that a projection of
-    standard normal ones is standard normal.
+    The default keeps the first two entries of the observation and projects the others. The
+    projections of standard normal entries are standard normal.
 
     Raises:
-      ConfigError: an unknown environment.
+      ConfigError: the environment is unknown.
     """
     own = envs.entry(env_name).phi
     if own is not None:

@@ -5,31 +5,33 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-# What mean 0 and variance 1 weigh before the first batch, as in the code of RND and in URLB.
+# Weight of the initial mean 0 and variance 1, as in the code of RND and in URLB.
 PRIOR_WEIGHT = 1e-4
 SMALLEST_DEVIATION = 1e-2
 
 
 class Moments(NamedTuple):
-    """Of everything met so far."""
+    """Mean and variance of all values seen so far."""
 
     mean: jax.Array  # [...]
     variance: jax.Array  # [...] mean squared deviation
-    weight: jax.Array  # [] float32, how many values that is
+    weight: jax.Array  # [] float32, how many values were seen
 
 
 def init(shape: tuple[int, ...] = ()) -> Moments:
-    """Mean 0 and variance 1, which the first batch replaces."""
+    """Returns mean 0 and variance 1, [*shape]; the first batch replaces them."""
     return Moments(jnp.zeros(shape), jnp.ones(shape), jnp.asarray(PRIOR_WEIGHT, jnp.float32))
 
 
 def update(moments: Moments, batch: jax.Array, valid: jax.Array | None = None) -> Moments:
-    """The moments with a batch merged into them.
+    """Merges a batch into the moments.
 
     Args:
       moments: [...].
       batch: [B, ...].
       valid: [B] bool, the rows that count; all of them when left out.
+    Returns:
+      The moments [...] of all values so far.
     Source: Chan, Golub & LeVeque 1979, the pairwise update of sums of squares.
     """
     valid = jnp.ones(batch.shape[0], bool) if valid is None else valid
@@ -50,12 +52,15 @@ def update(moments: Moments, batch: jax.Array, valid: jax.Array | None = None) -
 
 
 def normalized(moments: Moments, values: jax.Array, largest: float) -> jax.Array:
-    """[..., *S] with mean 0 and deviation 1 over what was met, and none beyond ± largest.
+    """Normalises values [..., *S] to mean 0 and deviation 1, and clips them to ± largest.
 
-    What hardly varied, by less than SMALLEST_DEVIATION, is not blown up.
+    A deviation below SMALLEST_DEVIATION is raised to it, so that a nearly constant value is not
+    magnified.
 
     Args:
-      moments: of shape [*S].
+      moments: [*S], of the values seen so far.
+      values: [..., *S].
+      largest: the largest magnitude of a result.
     """
     deviation = jnp.maximum(jnp.sqrt(moments.variance), SMALLEST_DEVIATION)
     mean, deviation = (jnp.broadcast_to(x, values.shape) for x in (moments.mean, deviation))

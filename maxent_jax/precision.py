@@ -1,4 +1,4 @@
-"""The package computes in 32 bits, also where a program has switched jax's 64 bits on."""
+"""Makes the package compute in 32 bits, even in a program that enables jax's 64 bits."""
 
 import functools
 from collections.abc import Callable
@@ -10,7 +10,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def in_32_bits(function: Function) -> Function:
-    """The function, of which everything is traced without `jax_enable_x64`."""
+    """Wraps a function so that all of it is traced without `jax_enable_x64`."""
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Rewards from distances to the reference states. R is the distance to the k-th nearest."""
+"""Rewards from R, the distance to the k-th nearest reference state."""
 
 from collections.abc import Callable
 
@@ -9,8 +9,8 @@ from maxent_jax.checks import check_number, check_whole
 from maxent_jax.density.entropy import log_density
 from maxent_jax.density.knn import knn_distances, smallest_k
 
-# Below this distance, in feature units, the logarithmic forms stop falling: a duplicate would be
-# -inf. Two states of one episode, a control step apart, lie about a hundred times farther.
+# Logarithmic forms stop falling below this distance (feature units), or a duplicate would be -inf.
+# Two states of one episode, a control step apart, are about a hundred times farther apart.
 DISTANCE_FLOOR = 1e-3
 
 
@@ -43,16 +43,16 @@ FORMS: dict[str, Callable[..., jax.Array]] = {
 
 
 def of_distance(distance: jax.Array, form: str, scale: float, dims: int) -> jax.Array:
-    """The reward of a state at distance R, [...] -> [...], dimensionless.
+    """Returns the reward of a state at distance R, [...] -> [...], dimensionless.
 
     Args:
-      distance: R, feature units; inf counts as about the largest float32 whose R/c is one too, so
-        that no reward is infinite.
+      distance: [...] R, in feature units. Infinity is replaced by about the largest float32 for
+        which R/c is also finite, so that no reward is infinite.
       form: one of FORMS.
-      scale: c, feature units.
+      scale: c, in feature units.
       dims: p, the number of features.
     """
-    largest = 0.5 * jnp.finfo(jnp.float32).max * jnp.minimum(scale, 1.0)  # half: c rounds
+    largest = 0.5 * jnp.finfo(jnp.float32).max * jnp.minimum(scale, 1.0)  # half, since c is rounded
     return FORMS[form](jnp.minimum(distance, largest), scale, dims)
 
 
@@ -65,20 +65,22 @@ def knn_reward(
     exclude: jax.Array | None = None,
     count: jax.Array | int | None = None,
 ) -> jax.Array:
-    """Particle reward: how far a state lies from the states that the mixture already visits.
+    """Returns the particle reward: how far a state is from those that the mixture visits.
 
     Args:
       features: [B, F] states to reward, in feature units (metres for the first two).
-      reference: [M, F] states drawn from the mixture, fixed while the reward is.
+      reference: [M, F] states drawn from the mixture, fixed between refreshes of the reward.
       num_neighbors: k.
-      scale: c, feature units.
+      scale: c, in feature units.
       form: one of FORMS.
-      exclude, count: as in knn_distances.
+      exclude: [B] int, as in `knn_distances`.
+      count: [] int, as in `knn_distances`.
     Returns:
       [B] dimensionless; log(1 + R/c) by default, at least 0.
     Raises:
       ValueError: M < k, an unknown form, or a scale that is not positive.
-    Source: Eq. 7; Liu & Abbeel 2021, Eq. 5. `log1p` departs from both in the 1 +.
+    Source: Eq. 7; Liu & Abbeel 2021, Eq. 5. `log1p` departs from both in the 1 +, see
+    docs/decisions.md, decision 2.
     """
     if form not in FORMS:
         raise ValueError(f"unknown reward form '{form}': choose one of {', '.join(FORMS)}")
@@ -94,10 +96,12 @@ def hazan_reward(
     num_neighbors: int,
     exclude: jax.Array | None = None,
 ) -> jax.Array:
-    """The gradient of the entropy at a state, log(1/density) - 1, [B, F] -> [B] nats.
+    """Returns the gradient of the entropy at each state, log(1/density) - 1, [B] nats.
 
-    By Prop. 1 it is an affine map, of slope 1, of p log R: intercept
-    log(N π^(p/2) / (k Γ(p/2 + 1))) - 1. Arguments as in knn_reward. Source: Eq. 10.
+    By Prop. 1 it is p log R + log(N π^(p/2) / (k Γ(p/2 + 1))) - 1.
+
+    Args: as `knn_reward`.
+    Source: Eq. 10.
     """
     return -_floored_log_density(features, reference, num_neighbors, exclude) - 1
 
@@ -109,14 +113,13 @@ def renyi_reward(
     alpha: float,
     exclude: jax.Array | None = None,
 ) -> jax.Array:
-    """(α - 1) log p at a state, [B, F] -> [B] nats: high where few states are, if α < 1.
+    """Returns (α - 1) log p at each state, [B] nats: high where states are rare.
 
-    Up to the factor α its exponential, p^(α - 1), is the gradient of ∫ p^α, whose logarithm over
-    1 - α is Rényi's entropy; the smaller α, the more rare states count.
+    Its exponential, p^(α - 1), is the gradient of ∫ p^α up to the factor α, and Rényi's entropy is
+    log(∫ p^α) / (1 - α). The smaller α, the more rare states count.
 
-    Args:
+    Args: as `knn_reward`, and
       alpha: the order, in (0, 1); at 1 the entropy is Shannon's and this form is 0.
-      features, reference, num_neighbors, exclude: as in knn_reward.
     Raises:
       ValueError: M < k, or alpha outside (0, 1).
     Source: Yuan et al. 2022 (RISE), whose R^(1 - α) leaves out the exponent p.
@@ -127,7 +130,7 @@ def renyi_reward(
 
 
 def _floored_log_density(features, reference, num_neighbors, exclude):
-    """[B] nats, bounded where a state is also a reference state."""
+    """[B] nats, finite also where a state is in the reference."""
     num_points = jnp.asarray(reference.shape[0], jnp.float32)
     if exclude is not None:
         num_points = num_points - (exclude >= 0)
@@ -138,7 +141,10 @@ def _floored_log_density(features, reference, num_neighbors, exclude):
 def floored_log_density(
     distance: jax.Array, num_points: jax.Array | int, num_neighbors: int, dims: int
 ) -> jax.Array:
-    """density.entropy.log_density, bounded where the distance is 0."""
+    """Returns log_density at a distance of at least DISTANCE_FLOOR, so that it is finite.
+
+    Args: as `density.entropy.log_density`.
+    """
     distance = jnp.maximum(distance, DISTANCE_FLOOR)
     return log_density(distance, num_points, num_neighbors, dims)
 
@@ -151,14 +157,21 @@ def shaped(
     alive: jax.Array,
     survives_death: bool,
 ) -> jax.Array:
-    """r + γΦ(s') - Φ(s), all [...] but for γ, `discount`.
+    """Adds potential-based shaping to a reward: r + γΦ(s') - Φ(s).
 
-    With Φ = 0 at a terminal state the optimal policies are those of r (Ng et al. 1999). With
-    `survives_death` a state in which health fails keeps its Φ, so that a death far out does not
-    cost what was gained on the way: not policy-invariant.
+    With Φ = 0 at terminal states this is policy-invariant: the optimal policies are those of r.
 
     Args:
-      alive: 0 where health failed at s', else 1; a time limit keeps its potential.
+      reward: [...] r.
+      potential: [...] Φ(s).
+      next_potential: [...] Φ(s').
+      discount: γ.
+      alive: [...] 0 where health failed at s', else 1; a time limit keeps its potential.
+      survives_death: also keep Φ where health failed, so that dying far out does not cost what
+        was gained on the way. The shaping is then not policy-invariant.
+    Returns:
+      [...] the shaped reward.
+    Source: Ng et al. 1999.
     """
     kept = jnp.ones_like(alive) if survives_death else alive
     return reward + discount * kept * next_potential - potential
@@ -167,18 +180,18 @@ def shaped(
 def episodic_bonus(
     features: jax.Array, earlier: jax.Array, count: jax.Array, num_neighbors: int
 ) -> jax.Array:
-    """How new a state is within its own episode.
+    """Returns how new each state is within its own episode.
 
     Args:
       features: [..., F] states.
-      earlier: [..., L, F] the states before each in its episode; the first `count` are filled.
+      earlier: [..., L, F] the earlier states of its episode; the first `count` are filled.
       count: [...] int.
       num_neighbors: k.
     Returns:
-      [...] the sum of the distances to the k nearest, feature units. With fewer than k earlier
-      states it is k times the mean over those there are; 0 with none.
+      [...] the sum of the distances to the k nearest, in feature units. With fewer than k
+        earlier states it is k times their mean distance; with none it is 0.
     Raises:
-      ValueError: k < 1, or shapes that do not match.
+      ValueError: k < 1, or the shapes do not match.
     Source: the paper's appendix; Badia et al. 2020 (NGU).
     """
     check_whole("num_neighbors", num_neighbors, least=1)

@@ -1,4 +1,4 @@
-"""Whole episodes of the mixture, one policy each."""
+"""Plays whole episodes of the mixture, each with one policy."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,16 +11,16 @@ from maxent_jax.envs.base import Env, State
 
 
 class Trajectories(NamedTuple):
-    """E episodes side by side. A step counts while `alive`: its state was reached before the end.
+    """E episodes in parallel. A step counts where `alive` is true.
 
-    A program that leaves a field unread does not keep it.
+    The compiler drops the fields that a program does not read.
     """
 
-    states: jax.Array  # [T, E, D] the state reached by each step
-    actions: jax.Array  # [T, E, A] that led there, in [-1, 1]
-    alive: jax.Array  # [T, E] bool
-    terminated: jax.Array  # [T, E] bool: the state ended its episode, as the environment says
-    num_invalid: jax.Array  # [] int32, steps at which the physics left the finite numbers
+    states: jax.Array  # [T, E, D] the state that each step reached
+    actions: jax.Array  # [T, E, A] in [-1, 1]
+    alive: jax.Array  # [T, E] bool: the episode had not ended, and the state is finite
+    terminated: jax.Array  # [T, E] bool: the environment ended the episode at this state
+    num_invalid: jax.Array  # [] int32, steps to a physics state that is not finite
 
 
 def episodes(
@@ -30,9 +30,10 @@ def episodes(
     episode_length: int,
     key: jax.Array,
 ) -> Trajectories:
-    """One episode from each start, to its end or the time limit.
+    """Plays one episode from each start, to its end or the time limit.
 
     Args:
+      env: the environment.
       starts: [E, ...].
       act: observation [E, D], key -> action [E, A].
       episode_length: T.
@@ -46,7 +47,7 @@ def episodes(
         reached = alive & valid
         states = jnp.where(valid[:, None], after.obs, current.obs)
         goes_on = reached & (after.done == 0)
-        # An ended episode waits at its start: whatever became of its physics is never stepped.
+        # An ended episode waits at its start, so that broken physics is never stepped again.
         current = base.select_rows(goes_on, after, starts)
         num_invalid = jnp.sum(alive & ~valid, dtype=jnp.int32)
         found = Trajectories(states, action, reached, reached & ~goes_on, num_invalid)

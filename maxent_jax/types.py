@@ -1,7 +1,7 @@
-"""The records that travel between modules, and the one legend of axis letters.
+"""Records that modules exchange, and the legend of axis letters.
 
-N envs, T time, B batch, D state, A action, F feature, M reference points, K neighbours,
-P policies, S seeds. Leading axes come first in every shape; `...` stands for any of them.
+N environments, T time, B batch, D state, A action, F feature, M reference points, K neighbours,
+P policies, S seeds. Leading axes come first in every shape; `...` stands for any number of them.
 """
 
 from typing import NamedTuple, Protocol
@@ -9,49 +9,49 @@ from typing import NamedTuple, Protocol
 import jax
 
 Metrics = dict[str, jax.Array]
-"""Diagnostics by name; nothing in it is needed for the next step."""
+"""Diagnostics by name. The next step does not depend on them."""
 
 
 class Features(Protocol):
-    """phi(s[..., D]) -> [..., F]: the space in which densities are measured."""
+    """A feature map, [..., D] -> [..., F]: densities are measured in the space of features."""
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the features, [F]."""
+        """The names of the features, [F]."""
 
     def __call__(self, observation: jax.Array, /) -> jax.Array:
-        """The features of states."""
+        """Returns the features [..., F] of states [..., D]."""
 
 
 class Transition(NamedTuple):
     """One environment step.
 
-    `next_observation` is the true state reached, also where the next episode starts from another.
-    Where `valid` is false the simulator left the finite numbers: the step ended its episode, and
-    nothing but the count of such steps may use it.
+    `next_observation` is the state that the step reached, also where the episode ended and the
+    next one starts elsewhere. Where `valid` is false, the physics state was not finite: the step
+    ends its episode, and is counted but never used.
     """
 
     observation: jax.Array  # [..., D]
     action: jax.Array  # [..., A], in [-1, 1]
     next_observation: jax.Array  # [..., D]
-    terminated: jax.Array  # [...] bool: health failed
-    truncated: jax.Array  # [...] bool: time limit alone
+    terminated: jax.Array  # [...] bool: the episode ended in a terminal state
+    truncated: jax.Array  # [...] bool: only the time limit ended it
     valid: jax.Array  # [...] bool
 
 
 class Distances(NamedTuple):
-    """Of a transition's ends to the reference that defines r_t, feature units."""
+    """Distances from a transition's two states to the reference that defines r_t, feature units."""
 
     reached: jax.Array  # [...] R(s')
-    potential: jax.Array  # [...] R(s) in the space of the potential; 0 without shaping
-    next_potential: jax.Array  # [...] the same of s'
+    potential: jax.Array  # [...] R(s) in the shaping's space; 0 without shaping
+    next_potential: jax.Array  # [...] the same for s'
 
 
 class Outcomes(NamedTuple):
-    """What n steps in a row of one episode brought, the first `taken` of them."""
+    """The results of n consecutive steps of one episode; only the first ones, `taken`, count."""
 
-    features: jax.Array  # [..., n, F] of the state left
-    next_features: jax.Array  # [..., n, F] of the state reached
+    features: jax.Array  # [..., n, F] of the state that the step left
+    next_features: jax.Array  # [..., n, F] of the state that it reached
     bonus: jax.Array  # [..., n] episodic term, feature units
     terminated: jax.Array  # [..., n] bool
     distances: Distances  # [..., n]
@@ -59,10 +59,10 @@ class Outcomes(NamedTuple):
 
 
 class Experience(NamedTuple):
-    """What the learner draws from the replay, see experience.py: n steps of one episode."""
+    """n steps of one episode, drawn from the replay for the learner (algorithm/experience.py)."""
 
-    observation: jax.Array  # [..., num_seen] before the first
-    action: jax.Array  # [..., A] the first, in [-1, 1]
-    next_observation: jax.Array  # [..., num_seen] after the last that was taken
+    observation: jax.Array  # [..., num_seen] before the first step
+    action: jax.Array  # [..., A] of the first step, in [-1, 1]
+    next_observation: jax.Array  # [..., num_seen] after the last step taken
     outcomes: Outcomes  # [..., n]
-    row: jax.Array  # [...] int32, of the first step in the replay
+    row: jax.Array  # [...] int32, the first step's row in the replay

@@ -19,7 +19,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_legacy_prng_key", "error")
 
 # Files that take longest come first, so that no worker is left with one at the end.
-LONGEST = ("test_protocol", "test_train", "test_knn", "test_physics", "test_bonuses")
+LONGEST = ("test_protocol", "test_train", "test_knn", "test_physics", "test_intrinsic")
 # Toy programs run for milliseconds and compile for seconds: they are spared most optimisations.
 FAST = "JAX_DISABLE_MOST_OPTIMIZATIONS"
 

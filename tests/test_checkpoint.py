@@ -112,7 +112,7 @@ def test_a_checkpoint_of_another_config_does_not_fit(tmp_path):
     config = preset("smoke", env="pendulum")
     files.write_config(tmp_path, config, {}, {})
     checkpoint.save(tmp_path, algorithm.start(config), Progress([], None, [], {}), {})
-    with pytest.raises(errors.CheckpointError, match="does not fit its config"):
+    with pytest.raises(errors.CheckpointError, match="does not match its config"):
         checkpoint.restore_results(tmp_path, "0", preset("smoke", env="pendulum", hidden_size=16))
 
 
@@ -135,7 +135,7 @@ def test_a_run_of_each_schema_loads(tmp_path, schema):
         assert train.read_arguments(again).config == run.config
     else:
         with pytest.raises(errors.RunError, match=f"it has schema {schema}, and this release"):
-            train.check_free(train.read_arguments(again))
+            train.read_arguments(again).claim.check()
 
 
 @jax.tree_util.register_pytree_node_class

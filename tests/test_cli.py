@@ -51,7 +51,7 @@ def ended(raised, capsys):
 def test_help_is_printed_where_letters_are_missing():
     done = shell('"$@"', "train", "--help-all", PYTHONIOENCODING="ascii")
     assert done.returncode == 0 and not done.stderr
-    assert b"lambda of the episodic term" in done.stdout.replace(b"\n", b" ")
+    assert b"lambda: weight of the episodic term" in done.stdout.replace(b"\n", b" ")
 
 
 def test_letters_are_spelled_and_bytes_of_a_file_name_kept():
@@ -145,7 +145,7 @@ def test_without_a_cache_folder_programs_are_compiled_anew(
     runtime.prepare(False)
     assert not jax.config.values["jax_enable_compilation_cache"]
     said = capsys.readouterr().err
-    assert said.startswith("note: programs are compiled anew") and said.count("\n") == 1
+    assert said.startswith("note: programs are compiled again") and said.count("\n") == 1
     runtime.prepare(False)
     assert not capsys.readouterr().err  # it is said once
 
@@ -234,7 +234,7 @@ def begin(directory):
 @pytest.mark.parametrize("flags", [[], ["--resume"], ["--overwrite"]])
 def test_a_directory_without_a_checkpoint_is_nobodys_run(tmp_path, flags):
     begin(tmp_path / "run")
-    train.check_free(train.read_arguments([*SMOKE, str(tmp_path / "run"), *flags]))
+    train.read_arguments([*SMOKE, str(tmp_path / "run"), *flags]).claim.check()
 
 
 def user_config(run):
@@ -257,13 +257,13 @@ def test_a_directory_with_anything_else_in_it_is_left_alone(tmp_path, change):
     change(tmp_path)
     arguments = train.read_arguments([*SMOKE, str(tmp_path)])
     with pytest.raises(UsageError, match="already exists"):
-        train.check_free(arguments)
+        arguments.claim.check()
 
 
 def test_a_config_of_the_users_is_not_removed_as_a_run(tmp_path):
     user_config(tmp_path)
     arguments = train.read_arguments([*SMOKE, str(tmp_path), "--overwrite"])
-    with pytest.raises(UsageError, match="left as it is"), train.claimed(arguments):
+    with pytest.raises(UsageError, match="left alone"), arguments.claim.hold():
         pass
     assert (tmp_path / files.CONFIG).exists()
 
@@ -272,9 +272,9 @@ def test_a_busy_directory_without_a_checkpoint_stays_busy(tmp_path):
     begin(tmp_path)
     arguments = train.read_arguments([*SMOKE, str(tmp_path)])
     with (
-        train.claimed(arguments),
+        arguments.claim.hold(),
         pytest.raises(UsageError, match="another process"),
-        train.claimed(arguments),
+        arguments.claim.hold(),
     ):
         pass
 
@@ -285,7 +285,7 @@ def test_a_place_that_cannot_be_written_is_known_at_once(tmp_path, monkeypatch, 
     (tmp_path / "nowhere").symlink_to("target")
     monkeypatch.setattr(os, "access", lambda place, mode: what != "read_only")
     with pytest.raises(UsageError, match="cannot write to"):
-        train.check_free(train.read_arguments([*SMOKE, str(tmp_path / what)]))
+        train.read_arguments([*SMOKE, str(tmp_path / what)]).claim.check()
 
 
 def test_every_text_file_names_its_encoding():

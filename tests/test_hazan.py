@@ -452,7 +452,7 @@ def test_a_corner_that_is_rewarded_is_visited_more():
         ({"train_steps": 1}, (1, 3, 3), "train_steps is 1, but must be at least 2"),
         ({"num_runs": 0}, (1, 3, 3), "num_runs is 0"),
         ({}, (1, 4, 4), r"must have \(1, 3, 3\)"),
-        ({}, (3, 3), "weights have the shape"),
+        ({}, (3, 3), "weights have shape"),
     ],
 )
 def test_what_does_not_fit_is_refused(changes, shape, message):
@@ -463,7 +463,7 @@ def test_what_does_not_fit_is_refused(changes, shape, message):
 
 def test_rows_that_are_no_weights_are_refused():
     keys = jax.random.split(jax.random.key(0), 1)
-    with pytest.raises(ValueError, match="of sum 1"):
+    with pytest.raises(ValueError, match="must sum to 1"):
         hazan.run(TOY, np.full((1, 3, 3), 1 / 3), keys)
     with pytest.raises(ValueError, match="no keys"):
         hazan.run(TOY, np.zeros((0, 3, 3)), keys[:0])

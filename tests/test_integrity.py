@@ -58,7 +58,7 @@ def test_a_config_that_was_changed_by_hand_is_noticed(run):
 def test_where_all_are_damaged_there_is_nothing_to_fall_back_to(run):
     for name in integrity.checkpoints(run):
         (run / FOLDER / name / MANIFEST).unlink()
-    with pytest.raises(errors.CheckpointCorruptError, match="none before it is intact"):
+    with pytest.raises(errors.CheckpointCorruptError, match="no earlier one is intact"):
         integrity.find(run, fallback=True)
 
 

@@ -69,7 +69,7 @@ def test_a_run_that_cannot_fit_is_refused_by_what_takes_most(monkeypatch, settin
     with pytest.raises(ConfigError) as refused:
         memory.check(config, jax.devices()[:1])
     said = str(refused.value)
-    assert said.startswith(f"{setting} is {config[setting.replace('-', '_')]}, with")
+    assert said.startswith(f"{setting} is {config[setting.replace('-', '_')]}, so")
     assert "but this machine has 8 GiB" in said
     memory.check(preset("smoke", env="pendulum"), jax.devices()[:1])
 

@@ -229,7 +229,7 @@ def test_a_finished_run_with_other_settings_is_no_cell(finished, monkeypatch, ca
         reproduce.main(["fig4", *TOY, "--out", str(out)])
     path.write_text(kept)
     assert stop.value.code == 1 and not trained
-    assert "other settings: eta was 0.5 and is 0.1. Going on" in capsys.readouterr().err
+    assert "other settings: eta was 0.5 and is 0.1. Continuing" in capsys.readouterr().err
 
 
 def test_a_cell_that_cannot_be_trained_does_not_keep_the_others_from_it(
@@ -247,7 +247,7 @@ def test_a_cell_that_cannot_be_trained_does_not_keep_the_others_from_it(
         reproduce.main(["fig4", *TOY, "--out", str(tmp_path)])
     assert stop.value.code == 1
     assert trained == [cell.name for cell in protocol.make("fig4", "toy", 1)]
-    assert "the loss is not finite. Going on with the next." in capsys.readouterr().err
+    assert "the loss is not finite. Continuing with the next cell." in capsys.readouterr().err
 
 
 def test_a_signal_reaches_the_jobs_and_is_waited_for(tmp_path, monkeypatch, capsys):

@@ -179,7 +179,7 @@ def test_the_comparison_draws_every_seed_in_its_runs_colour():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ((), "name the directory of a run"),
+        ((), "name the directory of one run"),
         (("{run}", "{run}"), "named twice"),
         (("{run}", "--episodes", "0"), "--episodes must be at least 1"),
         (("{run}", "--out", "{run}"), "cannot write to"),

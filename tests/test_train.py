@@ -15,7 +15,8 @@ import pytest
 from commands import ROOT, call, in_subprocess
 
 import maxent_jax
-from benchmarks import common, gpu
+from benchmarks import common
+from benchmarks.gpu import parts
 from maxent_jax import envs, errors
 from maxent_jax.commands import train
 from maxent_jax.config import preset
@@ -121,7 +122,7 @@ def test_resume_without_a_checkpoint_starts_over(tmp_path):
     files.write_config(tmp_path, config, {}, {})
     (tmp_path / "metrics.jsonl").write_text('{"iteration": 1}\n{"itera')
     resumed = train.read_arguments(["--preset", "smoke", "--out", str(tmp_path), "--resume"])
-    with train.claimed(resumed):
+    with resumed.claim.hold():
         driver.train(resumed.config, resumed.directory, time.perf_counter())
     assert [row["env_steps"] for row in files.read_metrics(tmp_path)] == [400, 800]
 
@@ -249,7 +250,7 @@ def test_a_damaged_checkpoint_is_named_and_passed_over_on_demand(finished, tmp_p
     with pytest.warns(UserWarning, match="checkpoint 2"):
         assert maxent_jax.load_run(directory, fallback=True).num_policies == 2
     done = call("train", "--out", directory, "--resume", "--fallback")
-    assert "goes on from checkpoint 1" in done.stderr
+    assert "continues from checkpoint 1" in done.stderr
     assert maxent_jax.load_run(directory).num_policies == 3
     assert "damaged" not in call("verify", directory).stdout
 
@@ -320,7 +321,7 @@ def rows_of(part, out):
 
 @pytest.mark.slow
 def test_what_a_gpu_is_asked_runs_on_a_cpu(tmp_path):
-    for part, asked in gpu.PARTS.items():
+    for part, asked in parts.PARTS.items():
         printed = benchmark("gpu", "--part", part, "--out", tmp_path)
         found = [row["section"] for row in rows_of(part, tmp_path)]
         assert "failed" not in found and len(set(found)) >= len(asked)

@@ -1,1 +1,1 @@
-"""What can be done to a run without harm: `python -m benchmarks.faults`, a part a file."""
+"""Failures that a run must survive: `python -m benchmarks.faults`; each file is one part."""

@@ -1,6 +1,6 @@
-"""Does a run survive what can befall it? A row for each fault: how often it was caused, what came.
+"""Does a run survive failures? Prints one row per fault, with the number of trials and the result.
 
-Parts run one after another; each row is printed as soon as it is known. `--toy` causes each fault
+Parts run one after another. Each row is printed as soon as it is known. `--toy` causes each fault
 once or a few times.
 """
 
@@ -28,7 +28,7 @@ PARTS = {
 
 def main() -> None:
     flags = argparse.ArgumentParser(description=__doc__)
-    flags.add_argument("--toy", action="store_true", help="each fault once or a few times")
+    flags.add_argument("--toy", action="store_true", help="cause each fault once or a few times")
     flags.add_argument("--part", nargs="+", choices=PARTS, default=list(PARTS))
     args = flags.parse_args()
     common.print_versions()

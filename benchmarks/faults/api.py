@@ -1,4 +1,4 @@
-"""Is every wrong argument of the Python API one sentence, of the class that its place has?"""
+"""Does every wrong argument of the Python API raise one sentence, of the right exception class?"""
 
 # Arguments are wrong on purpose.
 # mypy: disable-error-code="arg-type,operator"
@@ -24,22 +24,22 @@ from maxent_jax.runs import files
 from maxent_jax.sac import agent
 from maxent_jax.theory import bounds
 
-LONGEST = 1200  # letters of a sentence, that which names every environment included
+LONGEST = 1200  # letters of a sentence; the longest names every environment
 POINTS = np.zeros((5, 3), np.float32)
 GRID = Grid(("x", "y"), (0.0, 0.0), (1.0, 1.0), (10, 10))
 NAN = float("nan")
 
 
 class Places(NamedTuple):
-    """What calls need beside their arguments."""
+    """Paths and a run for the calls."""
 
-    folder: Path  # with no run, or with the files named in `places`
+    folder: Path  # without a run; with the files that `places` makes
     begun: Path  # a run without a checkpoint
-    run: Run  # two policies that nobody trained, on the pendulum
+    run: Run  # two untrained policies on the pendulum
 
 
 class Fault(NamedTuple):
-    """A call that cannot be right."""
+    """A wrong call, and the exception that it must raise."""
 
     what: str
     call: Callable[[Places], Any]
@@ -48,7 +48,7 @@ class Fault(NamedTuple):
 
 
 def places(folder: Path) -> Places:
-    """Made in that folder."""
+    """Makes the places in a folder."""
     begun = folder / "begun"
     begun.mkdir()
     files.write_config(begun, preset("smoke"), {}, {})
@@ -71,17 +71,17 @@ def places(folder: Path) -> Places:
 
 
 def knn_of(what: str, kind: type[Exception], says: str, *args: Any, **kwargs: Any) -> Fault:
-    """A search for neighbours."""
+    """A wrong search for neighbours."""
     return Fault(f"knn_distances: {what}", lambda _: knn.knn_distances(*args, **kwargs), kind, says)
 
 
 def config_of(kind: type[Exception], says: str, **settings: Any) -> Fault:
-    """Settings that no run can have."""
+    """Wrong settings."""
     return Fault(f"from_flat({settings})", lambda _: from_flat(settings), kind, says)
 
 
 def of(call: Callable[[Places], Any], kind: type[Exception], says: str) -> Fault:
-    """A call that its own sentence tells apart."""
+    """A wrong call, named by the sentence that it raises."""
     return Fault(says, call, kind, says)
 
 
@@ -117,7 +117,7 @@ FAULTS: tuple[Fault, ...] = (
     of(lambda p: p.run.rollout(-1), ValueError, "episodes_per_policy is -1"),
     of(lambda p: p.run.rollout(1.5), TypeError, "episodes_per_policy is 1.5"),
     of(lambda p: p.run.rollout(10**10), ConfigError, "episodes of 100 steps"),
-    of(lambda p: p.run.occupancy_of(_paths_of([0, 0])), ValueError, "of the policies [0]"),
+    of(lambda p: p.run.occupancy_of(_paths_of([0, 0])), ValueError, "of policies [0]"),
     of(lambda p: p.run.occupancy_of(_paths_of([0, 1, 7])), ValueError, "policies [0, 1, 7]"),
     of(lambda _: envs.make("antt"), ConfigError, "unknown env 'antt': did you mean 'ant'?"),
     of(lambda _: envs.make("brax:antt"), ConfigError, "did you mean 'brax:ant'?"),
@@ -158,7 +158,7 @@ FAULTS: tuple[Fault, ...] = (
     knn_of("NaN in a point", ValueError, "points hold a number", POINTS, POINTS * NAN, 1),
     knn_of("complex numbers", TypeError, "complex64", POINTS * 1j, POINTS, 1),
     knn_of("text", TypeError, "array of numbers", "a", POINTS, 1),
-    knn_of("ragged rows", TypeError, "cannot be made an array", [[1.0], [1.0, 2.0]], POINTS, 1),
+    knn_of("ragged rows", TypeError, "cannot be converted to", [[1.0], [1.0, 2.0]], POINTS, 1),
     knn_of("few to exclude", ValueError, "exclude has shape", POINTS, POINTS, 1, np.arange(3)),
     knn_of("floats to exclude", TypeError, "exclude is of dtype", POINTS, POINTS, 1, np.ones(5)),
     knn_of("few labels", ValueError, "labels has shape", POINTS, POINTS, 1, labels=np.arange(3)),
@@ -233,7 +233,7 @@ FAULTS: tuple[Fault, ...] = (
 
 
 def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
-    """One row; what was not met as it should be is in it."""
+    """Yields one row; it lists the faults with a wrong result."""
     made = places(folder)
     faults = FAULTS[:: 20 if short else 1]
     wrong = []
@@ -253,7 +253,7 @@ def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
 
 
 def meet(fault: Fault, made: Places) -> str:
-    """What is wrong with how it is met, "" for nothing."""
+    """Causes a fault and returns what is wrong with the result, or ""."""
     try:
         fault.call(made)
     except fault.kind as error:

@@ -1,4 +1,4 @@
-"""Two processes begin a run in one directory at once: does exactly one go on?"""
+"""Two processes start a run in one directory at once: does exactly one continue?"""
 
 import os
 import shutil
@@ -13,7 +13,7 @@ from maxent_jax.runs import files
 
 
 def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
-    """One row."""
+    """Yields one row."""
     times = 1 if short else 10
     trials = [_race(folder / str(i)) for i in range(times)]
     one_ran = sum(trial["one ran"] for trial in trials)
@@ -38,6 +38,6 @@ def _race(directory: Path) -> dict[str, Any]:
     one_ran = winner.poll() is None and loser.returncode == 2
     os.kill(winner.pid, signal.SIGKILL)
     winner.communicate()
-    smoke.finish(directory)  # with the lock of the dead
+    smoke.finish(directory)  # although the lock of the killed process is still there
     shutil.rmtree(directory)
     return {"one ran": one_ran, "said": said}

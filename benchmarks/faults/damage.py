@@ -1,4 +1,4 @@
-"""Does any damage to a checkpoint go unnoticed, and does its run go on from the one before?"""
+"""Is all damage to a checkpoint noticed, and does the run resume from the previous one?"""
 
 import random
 import shutil
@@ -16,10 +16,10 @@ NUM_FLIPS = 200
 
 
 def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
-    """A row for each kind of damage, done to every file of the latest checkpoint."""
+    """Yields a row for each kind of damage, done to every file of the latest checkpoint."""
     run = folder / "run"
     process = smoke.start(run)
-    while "1+1" not in integrity.checkpoints(run):  # in mid-iteration it has files of all kinds
+    while "1+1" not in integrity.checkpoints(run):  # within an iteration it has files of all kinds
         if process.poll() is not None:
             raise RuntimeError(f"a run ended early: {process.communicate()[1]}")
         time.sleep(0.01)
@@ -29,7 +29,7 @@ def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
     latest = run / FOLDER / integrity.checkpoints(run)[-1]
     files = sorted(path for path in latest.rglob("*") if path.is_file())
     rng = random.Random(0)
-    filled = [path for path in files if path.stat().st_size]  # Orbax leaves an empty one too
+    filled = [path for path in files if path.stat().st_size]  # Orbax also leaves an empty one
     flipped = filled if short else rng.choices(filled, k=NUM_FLIPS)
     kinds: tuple[tuple[str, list[Path], Callable[[Path], Any]], ...] = (
         ("truncated", filled, lambda path: path.write_bytes(_half(path.read_bytes()))),
@@ -50,7 +50,7 @@ def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
 
 
 def _damage(run: Path, path: Path, do: Callable[[Path], Any]) -> dict[str, bool]:
-    """To one file, undone afterwards."""
+    """Damages one file, checks the result, and restores the file."""
     before = path.read_bytes()
     do(path)
     name = path.relative_to(run / FOLDER).as_posix().split("/", 1)[1]
@@ -85,7 +85,7 @@ def _flip(content: bytes, rng: random.Random) -> bytes:
 
 
 def _foreign(run: Path, latest: Path) -> Iterator[dict[str, Any]]:
-    """What a hand that also wrote a manifest could do."""
+    """Manipulations by someone who can also write a manifest."""
     secret = run.parent / "secret"
     secret.write_text("", encoding="utf-8")
     progress = latest / "progress.json"

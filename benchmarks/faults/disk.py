@@ -1,4 +1,4 @@
-"""What does a full disk cost? A real one, of memory, mounted for this process alone."""
+"""What does a full disk cost? The disk is real (tmpfs), mounted for this process alone."""
 
 import contextlib
 import json
@@ -19,7 +19,7 @@ from maxent_jax.runs import checkpoint, driver, files, integrity
 from maxent_jax.visual import plotting
 
 MEGABYTES = 16
-# Whose writing meets the full disk, and the most bytes that are left for it.
+# The writers that find a full disk, and the largest number of bytes left for them.
 WRITERS: tuple[tuple[str, Any, str, int], ...] = (
     ("checkpoint", checkpoint, "save", 200_000),
     ("log", files, "append_metrics", 0),
@@ -28,18 +28,18 @@ WRITERS: tuple[tuple[str, Any, str, int], ...] = (
 
 
 def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
-    """A row for each writer, from a process with a namespace of its own, in which one may mount."""
+    """Yields a row for each writer, from a process in its own namespace, in which it may mount."""
     apart = ("unshare", "--user", "--map-root-user", "--mount", "sh", "-c")
     mounted = f'mount -t tmpfs -o size={MEGABYTES}m none {folder} && exec "$0" "$@"'
     inner = (sys.executable, "-m", "benchmarks.faults.disk", str(folder), str(int(short)))
     done = subprocess.run([*apart, mounted, *inner], capture_output=True, text=True, check=False)
     if done.returncode:
-        raise RuntimeError(f"no small disk could be mounted and filled: {done.stderr}")
+        raise RuntimeError(f"a small disk could not be mounted and filled: {done.stderr}")
     yield from map(json.loads, done.stdout.splitlines())
 
 
 def fill(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
-    """With `folder` on the small disk."""
+    """Yields the rows; `folder` is on the small disk."""
     undisturbed, rng = folder / "undisturbed", random.Random(0)
     _train(undisturbed)
     for what, module, name, most in WRITERS:
@@ -90,17 +90,17 @@ def _trial(undisturbed: Path, directory: Path, module: Any, name: str, left: int
 
 
 def _fill(ballast: Path, left: int) -> None:
-    """With a file that leaves so many bytes, in whole pages."""
+    """Fills the disk with a file that leaves `left` bytes, in whole pages."""
     free = os.statvfs(ballast.parent)
     with open(ballast, "wb") as file:
         file.write(bytes(max(free.f_bavail * free.f_frsize - left, 0)))
 
 
 def _train(directory: Path) -> None:
-    """A smoke run in this process, to its end, as the command line makes it."""
+    """A complete smoke run in this process, as from the command line."""
     arguments = train.read_arguments([*smoke.SMOKE, "--out", str(directory), "--resume"])
     options = driver.Options(save_minutes=arguments.save_minutes)
-    with train.claimed(arguments), contextlib.redirect_stdout(sys.stderr):
+    with arguments.claim.hold(), contextlib.redirect_stdout(sys.stderr):
         driver.train(arguments.config, directory, time.perf_counter(), options)
 
 

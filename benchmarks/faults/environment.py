@@ -1,7 +1,7 @@
-"""Do variables, streams, limits and paths that a user may have end in a traceback, or in damage?
+"""Do a user's variables, streams, limits and paths lead to a traceback, or to damage?
 
-Each fault is a command of ours in a shell: it must end with the code that is expected, at most one
-sentence on standard error beside its progress, and never a traceback.
+Each fault is a command of ours in a shell. It must end with the expected exit code, print at most
+one sentence on standard error in addition to its progress, and never a traceback.
 """
 
 import os
@@ -21,16 +21,16 @@ from maxent_jax.runs import files, locks
 
 COMMAND = '"$@"'
 UNLIMITED_SECONDS = 600
-REFUSAL_SECONDS = 5.0  # jax is loaded before some are known; 3 s where nothing else runs
+REFUSAL_SECONDS = 5.0  # some are known only after jax is loaded; 3 s if nothing else runs
 # A smoke run that takes seconds.
 TRAIN = "train --preset smoke --env pendulum --out {new}"
-# A command that loads no array library, on a run that is there.
+# A command that loads no array library, on an existing run.
 VERIFY = "verify {run}"
 TOO_LARGE = "train --preset smoke --env pendulum --replay-size 2000000000"
 LEAVING = "cd {gone}; rmdir {gone}; "  # the working folder is gone
 READ_ONLY = "mount --bind {run} {run} && mount -o remount,ro,bind {run} && "
 
-# What a run says when all is well; a path in it may hold a line's end.
+# What a run prints without a fault; a path in it may contain a line break.
 PROGRESS = re.compile(
     r"^(\w+ on \w+, preset .*? Ctrl-C saves the run|compiled[^\n]*|iteration \d[^\n]*)\n",
     re.MULTILINE | re.DOTALL,
@@ -38,15 +38,15 @@ PROGRESS = re.compile(
 
 
 class Fault(NamedTuple):
-    """Something that is wrong around a command."""
+    """A command in a wrong environment, and the result that it must have."""
 
     arguments: str  # of maxent_jax
-    code: int  # with which it must end
-    says: str = ""  # on standard error, among other words; "" for nothing at all
+    code: int  # expected exit code
+    says: str = ""  # expected words on standard error; "" if it must be empty
     shell: str = COMMAND  # what runs it
-    variables: str = ""  # of the environment, NAME=VALUE; -NAME takes one away
-    same: bool = False  # it trains, and ends with the bits of a run to which nothing was done
-    apart: bool = False  # in a namespace of its own, in which it may mount
+    variables: str = ""  # of the environment, NAME=VALUE; -NAME removes one
+    same: bool = False  # it must train, bit-identical to an undisturbed run
+    apart: bool = False  # in its own namespace, in which it may mount
 
 
 def refused(variables: str, says: str) -> Fault:
@@ -60,12 +60,12 @@ def harmless(variables: str, says: str = "") -> Fault:
 
 
 def shown(variables: str) -> Fault:
-    """A variable that has to do with what is printed."""
+    """A variable that affects printing."""
     return Fault("train --help", 0, variables=variables)
 
 
 def to(out: str, code: int, says: str = "") -> Fault:
-    """A run into a directory of that name, in the middle of other things."""
+    """A run into a directory with a special name or place."""
     return Fault(f"train --preset smoke --env pendulum --out {out}", code, says)
 
 
@@ -83,8 +83,8 @@ GROUPS: dict[str, tuple[Fault, ...]] = {
         refused("JAX_NUM_CPU_DEVICES=many", "jax_num_cpu_devices"),
         refused("JAX_NUM_CPU_DEVICES=0", "jax finds no device"),
         refused("XLA_FLAGS=--no_such_flag", "Unknown flag in XLA_FLAGS"),
-        refused("XLA_FLAGS=--xla_cpu_enable_fast_math=maybe", "with which XLA cannot start"),
-        refused("XLA_FLAGS=/no/such/file", "with which XLA cannot start"),
+        refused("XLA_FLAGS=--xla_cpu_enable_fast_math=maybe", "but XLA cannot start with it"),
+        refused("XLA_FLAGS=/no/such/file", "but XLA cannot start with it"),
         Fault("evaluate {run}", 2, "'bogus'", variables="JAX_PLATFORMS=bogus"),
         Fault("report {run}", 2, "'bogus'", variables="JAX_PLATFORMS=bogus"),
         Fault("theory --toy --out {new}", 2, "'bogus'", variables="JAX_PLATFORMS=bogus"),
@@ -102,9 +102,9 @@ GROUPS: dict[str, tuple[Fault, ...]] = {
         harmless("JAX_TRANSFER_GUARD=disallow"),
         harmless("JAX_RAISE_PERSISTENT_CACHE_ERRORS=1 JAX_COMPILATION_CACHE_DIR={empty}"),
         Fault("evaluate {run}", 0, "/proc/none", variables="JAX_COMPILATION_CACHE_DIR=/proc/none"),
-        harmless("XDG_CACHE_HOME={file}", "compiled anew"),
+        harmless("XDG_CACHE_HOME={file}", "compiled again"),
         harmless("-HOME -XDG_CACHE_HOME"),
-        Fault("evaluate {run}", 0, "anew", variables="HOME=/proc/none -XDG_CACHE_HOME"),
+        Fault("evaluate {run}", 0, "again", variables="HOME=/proc/none -XDG_CACHE_HOME"),
         harmless("TMPDIR=/no/such/folder"),
         harmless("MPLBACKEND=bogus"),
         harmless("MPLCONFIGDIR={file}"),
@@ -153,13 +153,13 @@ GROUPS: dict[str, tuple[Fault, ...]] = {
         Fault(TRAIN, 0, shell='ulimit -c 0; "$@"', same=True),
         Fault(f"{TOO_LARGE} --out {{new}}", 2, "of memory, but this machine has"),
         Fault(f"{TOO_LARGE} --out {{new}}", 2, "(ulimit -v)", 'ulimit -v 8000000; "$@"'),
-        Fault("train --hidden-size 100000 --out {new}", 2, "hidden-size is 100000, with which"),
-        Fault("train --num-seeds 100000 --out {new}", 2, "num-seeds is 100000, with which"),
-        Fault("train --num-starts 2000000000 --out {new}", 2, "num-starts is 2000000000, with"),
+        Fault("train --hidden-size 100000 --out {new}", 2, "hidden-size is 100000, so the run"),
+        Fault("train --num-seeds 100000 --out {new}", 2, "num-seeds is 100000, so the run"),
+        Fault("train --num-starts 2000000000 --out {new}", 2, "num-starts is 2000000000, so"),
         Fault("evaluate {run} --episodes 100000000", 2, "choose fewer"),
         Fault("report {run} --episodes 100000000", 2, "choose fewer"),
-        Fault("evaluate {run}", 2, "cannot be written to", READ_ONLY + COMMAND, apart=True),
-        Fault("report {run}", 2, "cannot be written to", READ_ONLY + COMMAND, apart=True),
+        Fault("evaluate {run}", 2, "is not writable", READ_ONLY + COMMAND, apart=True),
+        Fault("report {run}", 2, "is not writable", READ_ONLY + COMMAND, apart=True),
         Fault(VERIFY, 0, "", READ_ONLY + COMMAND, apart=True),
         Fault("train --resume --out {run}", 2, "not writable", READ_ONLY + COMMAND, apart=True),
         Fault("train --overwrite --out {run}", 2, "not writable", READ_ONLY + COMMAND, apart=True),
@@ -179,7 +179,7 @@ GROUPS: dict[str, tuple[Fault, ...]] = {
         Fault(VERIFY, 0, shell=LEAVING + COMMAND),
         to("{link}", 0),
         to("{begun}", 0),
-        to("{dangling}", 2, "a link to nowhere"),
+        to("{dangling}", 2, "a broken link"),
         to("{file}", 2, "already exists"),
         to("{file}/run", 2, "cannot write"),
         to("{fifo}", 2, "already exists"),
@@ -188,7 +188,7 @@ GROUPS: dict[str, tuple[Fault, ...]] = {
         to("{empty}/" + "a" * 300, 2, "File name too long"),
         to("''", 2, "out is empty"),
         to("{foreign}", 2, "already exists"),
-        to("'{foreign}' --overwrite", 2, "left as it is"),
+        to("'{foreign}' --overwrite", 2, "left alone"),
         to("{logs}", 2, "already exists"),
         Fault("verify ''", 2, "not the directory of a run"),
         Fault("verify {file}", 2, "not the directory of a run"),
@@ -198,7 +198,7 @@ GROUPS: dict[str, tuple[Fault, ...]] = {
 
 
 def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
-    """A row for each group; what was not met as it should be is in it."""
+    """Yields a row for each group; it lists the faults with a wrong result."""
     places = _places(folder)
     if short:  # no run is trained
         files.write_config(places["run"], preset("smoke", env="pendulum"), {}, {})
@@ -224,12 +224,12 @@ def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
 
 
 def _is_cheap(fault: Fault) -> bool:
-    """Whether it neither trains nor needs a run that has."""
+    """Whether it neither trains nor needs a trained run."""
     return fault.code != 0 and "{run}" not in fault.arguments and not fault.same
 
 
 def _places(folder: Path) -> dict[str, Path]:
-    """Paths, by what is wrong with them."""
+    """Paths by what is wrong with them."""
     names = ("missing", "empty", "run", "file", "fifo", "link", "dangling", "begun", "foreign")
     places = {name: folder / name for name in (*names, "logs", "gone", "undisturbed")}
     for name in ("empty", "run"):
@@ -249,7 +249,7 @@ def _places(folder: Path) -> dict[str, Path]:
 
 
 def _cause(fault: Fault, places: dict[str, Path], new: Path) -> tuple[str, float]:
-    """What is wrong with how the fault is met, "" for nothing, and the seconds that took."""
+    """Causes a fault; returns what is wrong with the result, or "", and the seconds."""
     places = places | {"new": new}
     places["gone"].mkdir(exist_ok=True)
     filled = {name: str(path) for name, path in places.items()}

@@ -1,4 +1,4 @@
-"""Is every mistake at the command line one sentence, at once, and exit code 2?"""
+"""Does every mistake on the command line give one sentence, at once, and exit code 2?"""
 
 import json
 import os
@@ -16,17 +16,17 @@ SECONDS = 3.0
 
 
 class Mistake(NamedTuple):
-    """A command line that cannot be right."""
+    """A wrong command line, and words of the message that it must give."""
 
     module: str
     arguments: str
-    says: str  # among other words
-    without: str = ""  # a package that is taken for missing
+    says: str  # expected words
+    without: str = ""  # a package to be treated as missing
     environment: tuple[str, str] = ("", "")
 
 
 def train(arguments: str, says: str) -> Mistake:
-    """Of training."""
+    """A wrong command line of `train`."""
     return Mistake("experiments.train", arguments, says)
 
 
@@ -63,7 +63,7 @@ MISTAKES = (
     train("--num-processes 2", "need --coordinator"),
     train("--save-iterations 0", "save-iterations is 0"),
     train("--save-minutes 0", "save-minutes is 0"),
-    train("--fallback", "fallback needs --resume"),
+    train("--fallback", "fallback is only for --resume"),
     train("--resume --overwrite", "exclude each other"),
     train("--out {run}", "already exists"),
     train("--out {file}", "already exists"),
@@ -80,7 +80,7 @@ MISTAKES = (
     train("--mixture-episodes 100000000", "states are counted in 32 bits"),
     train("extra", "Unrecognized options: extra"),
     train("--out {foreign} --resume", "not the directory of a run"),
-    train("--out {foreign} --overwrite", "left as it is"),
+    train("--out {foreign} --overwrite", "left alone"),
     train("--out {newer} --resume", "schema 99"),
     train("--preset smoke --seed 7 --out {run} --resume", "seed was 0 and is 7"),
     Mistake("experiments.train", "--wandb project", "maxent_jax[log]", without="wandb"),
@@ -103,7 +103,7 @@ MISTAKES = (
     Mistake("experiments.verify", "{empty}", "not the directory of a run"),
     Mistake("experiments.verify", "{begun}", "no complete checkpoint"),
     Mistake("experiments.evaluate", "{begun}", "no complete checkpoint"),
-    Mistake("maxent_jax", "", "name a command"),
+    Mistake("maxent_jax", "", "no command is given"),
     Mistake("maxent_jax", "trian", "did you mean 'train'?"),
     Mistake("maxent_jax", "--nonsense", "unknown command '--nonsense'"),
     Mistake("maxent_jax", "verify {empty}", "not the directory of a run"),
@@ -118,7 +118,7 @@ MISTAKES = (
 
 
 def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
-    """One row; what was not met as it should be is in it."""
+    """Yields one row; it lists the mistakes with a wrong result."""
     places = _places(folder)
     mistakes = MISTAKES[:: 20 if short else 1]
     found = [_make(mistake, places) for mistake in mistakes]
@@ -135,7 +135,7 @@ def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
 
 
 def _places(folder: Path) -> dict[str, Path]:
-    """Directories, by what is wrong with them."""
+    """Directories by what is wrong with them."""
     names = ("missing", "empty", "foreign", "newer", "begun", "run", "pendulum")
     places = {name: folder / name for name in names}
     for name in names[1:]:
@@ -148,14 +148,16 @@ def _places(folder: Path) -> dict[str, Path]:
     files.write_config(places["run"], preset("smoke"), {}, {})
     files.write_config(places["pendulum"], preset("smoke", env="pendulum"), {}, {})
     for name in ("run", "pendulum"):
-        (places[name] / integrity.FOLDER / "2").mkdir(parents=True)  # saved, by its name
+        (places[name] / integrity.FOLDER / "2").mkdir(
+            parents=True
+        )  # the name of a saved checkpoint
     places["file"] = folder / "file"
     places["file"].write_text("", encoding="utf-8")
     return places
 
 
 def _make(mistake: Mistake, places: dict[str, Path]) -> tuple[str, float]:
-    """What is wrong with how it is met, "" for nothing, and the seconds that took."""
+    """Makes a mistake; returns what is wrong with the result, or "", and the seconds."""
     arguments = mistake.arguments.format(**places).split()
     code = (
         f"import runpy, sys; sys.modules[{mistake.without!r}] = None; "

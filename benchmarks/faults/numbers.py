@@ -1,4 +1,4 @@
-"""Numbers that are not finite: in an observation they are contained, elsewhere they end the run."""
+"""Non-finite numbers: is one in an observation contained, and does any other end the run?"""
 
 import contextlib
 import sys
@@ -19,17 +19,17 @@ from maxent_jax.runs import checkpoint, driver, files, integrity
 
 
 class Faulty(Pendulum):
-    """A pendulum whose state is lost on one side."""
+    """A pendulum whose observation is NaN on one side."""
 
     def step(self, state, action):
-        """As the pendulum's, or not a number."""
+        """Takes the pendulum's step, or gives NaN."""
         after = super().step(state, action)
         lost = after.obs[1] > 0.1  # sin θ
         return after.replace(obs=jnp.where(lost, jnp.nan, after.obs))
 
 
 def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
-    """A row for each place where a number is lost; the last two overflow by a setting of theirs."""
+    """Yields a row for each place with a non-finite number; the last two overflow by a setting."""
     envs.register("faulty", lambda backend, physics: Faulty())
     directory = folder / "observation"
     error = _train(directory, env="user:faulty")
@@ -50,12 +50,12 @@ def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
             "times": 1,
             "said": error.replace(str(folder), "DIR"),
             "non-finite in checkpoints": found,
-            "passed": "iteration 1 left the finite numbers" in error and not found,
+            "passed": "iteration 1 produced a number that is not finite" in error and not found,
         }
 
 
 def _train(directory: Path, **changes: Any) -> str:
-    """Of a smoke run, saved at every boundary: what it ended with."""
+    """Trains a smoke run, saved at every boundary; returns its error, or ""."""
     directory.mkdir()
     config = preset("smoke", **changes)
     try:
@@ -67,7 +67,7 @@ def _train(directory: Path, **changes: Any) -> str:
 
 
 def _num_not_finite(directory: Path) -> int:
-    """In all checkpoints, and in all but the missing values of the metrics."""
+    """Counts the non-finite numbers in all checkpoints."""
     config, found = files.read_config(directory), 0
     for name in integrity.checkpoints(directory):
         state = checkpoint.restore(directory, name, config)

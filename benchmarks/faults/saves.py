@@ -1,4 +1,4 @@
-"""Do memory, open files or the disk grow with the number of checkpoints?"""
+"""Do memory, open files or disk usage grow with the number of checkpoints?"""
 
 import os
 from collections.abc import Iterator
@@ -11,12 +11,12 @@ from maxent_jax.runs import checkpoint, files
 from maxent_jax.runs.checkpoint import Progress
 
 NUM_SAVES = 300
-SETTLED = 50  # saves after which nothing may grow
+SETTLED = 50  # saves after which nothing may grow any more
 ROOM = 1.1
 
 
 def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
-    """One row."""
+    """Yields one row."""
     num_saves = 20 if short else NUM_SAVES
     config = preset("smoke", env="pendulum")
     state = algorithm.start(config)

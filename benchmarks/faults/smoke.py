@@ -1,4 +1,4 @@
-"""The run that faults are done to, and whether two runs are the same to the bit."""
+"""The run that the faults are tried on, and whether two runs are bit-identical."""
 
 import subprocess
 import sys
@@ -11,23 +11,23 @@ import numpy as np
 
 from maxent_jax.runs import checkpoint, files, integrity
 
-# Saved at every boundary, so that a fault may meet a checkpoint as well as the work between two.
+# Saved at every boundary, so that a fault may occur in a checkpoint or between two.
 SMOKE = ("--preset", "smoke", "--save-minutes", "1e-9")
 
 
 def command(directory: Path, *flags: str) -> list[str]:
-    """Of a smoke run in that directory."""
+    """Returns the command of a smoke run in a directory."""
     return [sys.executable, "-m", "experiments.train", *SMOKE, "--out", str(directory), *flags]
 
 
 def train_pendulum(directory: Path) -> None:
-    """A run that takes seconds, to its end."""
+    """Runs a smoke run on the pendulum to its end, which takes seconds."""
     small = ("train", "--preset", "smoke", "--env", "pendulum", "--out", str(directory))
     subprocess.run([sys.executable, "-m", "maxent_jax", *small], capture_output=True, check=True)
 
 
 def start(directory: Path, *flags: str) -> subprocess.Popen[str]:
-    """A smoke run in a process of its own."""
+    """Starts a smoke run in its own process."""
     return subprocess.Popen(
         command(directory, *flags),
         stdout=subprocess.DEVNULL,
@@ -37,7 +37,7 @@ def start(directory: Path, *flags: str) -> subprocess.Popen[str]:
 
 
 def finish(directory: Path, *flags: str) -> float:
-    """A smoke run to its end, resumed if it has begun; its seconds."""
+    """Runs a smoke run to its end, resuming it if it has begun; returns the seconds."""
     started = time.perf_counter()
     done = subprocess.run(
         command(directory, "--resume", *flags), capture_output=True, text=True, check=False
@@ -48,7 +48,7 @@ def finish(directory: Path, *flags: str) -> float:
 
 
 def same(one: Path, other: Path) -> bool:
-    """Whether two runs ended alike: states, metrics but for the clock, and no figure missing."""
+    """Tells whether two runs have bit-identical states, and equal metrics and figure names."""
     states = [_state(directory) for directory in (one, other)]
     equal_bits = jax.tree.map(lambda a, b: a.tobytes() == b.tobytes(), *states)
     figures = [sorted(p.name for p in (d / files.FIGURES).iterdir()) for d in (one, other)]
@@ -60,7 +60,7 @@ def same(one: Path, other: Path) -> bool:
 
 
 def timeless(directory: Path) -> list[dict[str, Any]]:
-    """The lines of metrics.jsonl without what the clock has a part in."""
+    """Returns the lines of metrics.jsonl without the values that depend on the clock."""
     lines = (directory / files.METRICS).read_text(encoding="utf-8").splitlines()
     assert len(lines) == len(files.read_metrics(directory)), "an unfinished line"
     rows = files.read_metrics(directory)

@@ -1,4 +1,4 @@
-"""Is a run that was killed or asked to stop, and then resumed, the run that nothing happened to?"""
+"""Is a run that was killed or stopped, and then resumed, bit-identical to an undisturbed one?"""
 
 import random
 import shutil
@@ -13,7 +13,7 @@ from maxent_jax.runs import integrity
 
 
 def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
-    """A row for each signal: how often it was sent, and how often the run ended bit-identical."""
+    """Yields a row for each signal: how often it was sent, how often the run was bit-identical."""
     undisturbed = folder / "undisturbed"
     smoke.finish(undisturbed)  # compiles
     shutil.rmtree(undisturbed)
@@ -38,9 +38,9 @@ def measure(folder: Path, short: bool) -> Iterator[dict[str, Any]]:
 
 
 def _stop(undisturbed: Path, directory: Path, number: signal.Signals, after: float):
-    """A run that gets a signal so many seconds after its start, and is then resumed to its end."""
+    """Sends a signal to a run after some seconds, then resumes the run to its end."""
     process = smoke.start(directory)
-    if number != signal.SIGKILL:  # before it can listen, any process ends as the system has it
+    if number != signal.SIGKILL:  # earlier, the system's default handler ends it
         while process.poll() is None and not integrity.checkpoints(directory):
             time.sleep(0.01)
         after /= 5
@@ -61,7 +61,7 @@ def _stop(undisturbed: Path, directory: Path, number: signal.Signals, after: flo
 
 
 def _ended_as_told(trial: dict[str, Any]) -> bool:
-    """Killed at once; asked to stop, with a checkpoint and the code that shells expect."""
+    """Whether the exit code is that of the signal, or 0."""
     number = trial["signal"]
     expected = -number if number == signal.SIGKILL else 128 + number
     return trial["exit_code"] in (0, expected)

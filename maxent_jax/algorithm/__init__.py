@@ -1,4 +1,4 @@
-"""Algorithm 1 of the paper: the outer loop, the training within an iteration, and its methods."""
+"""Algorithm 1 of the paper: the outer loop, training within an iteration, and the methods."""
 
 from maxent_jax.algorithm.loop import (
     EVALUATION_SEED,

@@ -1,4 +1,4 @@
-"""Is a policy trained? The rule that ends step 4 of Algorithm 1 before its budget is spent."""
+"""The rule that ends step 4 of Algorithm 1 early, when the reward has stopped rising."""
 
 from collections.abc import Sequence
 
@@ -6,18 +6,19 @@ import numpy as np
 
 
 def has_plateaued(rewards: Sequence[float], patience: int, tolerance: float) -> bool:
-    """Whether the reward of the last segments has stopped rising.
+    """Tells whether the reward has stopped rising in the last segments.
 
-    It has when, since its lowest segment, the mean of the last `patience` segments lies above that
-    of the `patience` before them by at most `tolerance` of all that the reward rose. A reward that
-    falls, as where a policy first unlearns what it knew, is at its lowest: that is no plateau. One
-    that has not moved yet is one, so patience must outlast the wait. Adding a constant to the
-    reward, or scaling it, changes nothing.
+    The rule looks at the segments since the lowest one. The reward has a plateau if the mean of the
+    last `patience` segments exceeds that of the `patience` segments before them by at most
+    `tolerance` times its whole rise. A falling reward, as when a policy first unlearns what it
+    knew, is at its lowest and so is not a plateau. A reward that has not moved yet is one, so
+    `patience` must be longer than that phase. A constant added to the reward, or a positive factor,
+    changes nothing.
 
     Args:
       rewards: mean unshaped r_t of each segment so far, in order.
-      patience: segments; 0 switches the rule off.
-      tolerance: a share.
+      patience: number of segments; 0 switches the rule off.
+      tolerance: a share of the rise.
     """
     if patience < 1 or len(rewards) < 2 * patience:
         return False

@@ -1,9 +1,10 @@
-"""Where the state of a run lies on several devices: seeds first, then environments.
+"""Places the state of a run on several devices: seeds first, then environments.
 
-Nothing here computes. The functions are those of one device. A device with seeds of its own runs
-them on these and exchanges nothing but metrics. Where several share a seed XLA parts the work: each
-steps its environments, holds its part of the replay, and updates its own copy of the networks. What
-C++ computes on a CPU (C MuJoCo, the search) XLA cannot part: there each computes all of its seed.
+The functions are those for one device; this module only says where their data lies. A device with
+seeds of its own runs them alone and exchanges only metrics. Where several devices share a seed, XLA
+divides the work: each device steps its environments, holds its share of the replay, and updates its
+own copy of the networks. XLA cannot divide what C++ computes on a CPU (C MuJoCo, the
+nearest-neighbour search): there each device computes all of its seed.
 """
 
 import math
@@ -22,10 +23,10 @@ SEEDS, ENVS = "seeds", "envs"  # the mesh's axes
 
 
 def make_mesh(config: Config, devices: Sequence[jax.Device]) -> Mesh:
-    """A mesh in which as many devices as can have seeds of their own, and the rest share those.
+    """Returns a mesh over seeds as far as they divide; the other devices share seeds.
 
     Raises:
-      ConfigError: the devices that share a seed cannot share its environments and replay evenly.
+      ConfigError: the devices that share a seed cannot divide its environments and replay evenly.
     """
     across_seeds = math.gcd(config.num_seeds, len(devices))
     sharing = len(devices) // across_seeds
@@ -33,25 +34,25 @@ def make_mesh(config: Config, devices: Sequence[jax.Device]) -> Mesh:
         if config[name] % sharing:
             raise ConfigError(
                 f"{name.replace('_', '-')} is {config[name]}, but must be a multiple of "
-                f"{sharing}: so many devices share a seed."
+                f"{sharing}, the number of devices that share a seed."
             )
     axis_types = (AxisType.Auto, AxisType.Auto)
     return jax.make_mesh((across_seeds, sharing), (SEEDS, ENVS), axis_types, devices=devices)
 
 
 def placement(config: Config, mesh: Mesh) -> State:
-    """The sharding of every leaf of the state."""
+    """Returns the sharding of every leaf of the state."""
     specs = _specs(config, (ENVS,))
     return jax.tree.map(lambda spec: NamedSharding(mesh, spec), specs)
 
 
 def start(config: Config, placed: State) -> State:
-    """algorithm.start, each part made where it will lie."""
+    """Runs `algorithm.start`; each leaf is made on the devices that hold it."""
     return jax.jit(lambda: algorithm.start(config), out_shardings=placed)()
 
 
 def programs(config: Config, placed: State) -> Programs:
-    """algorithm.programs for a state that is placed so; every device ends with the metrics."""
+    """Returns `algorithm.programs` for a state placed so; every device gets the metrics."""
     mesh = placed.iteration.mesh  # type: ignore[attr-defined]  # a sharding stands for the leaf
     functions = algorithm.functions(config.program(), config.num_seeds > 1)
     if config.num_seeds > 1:
@@ -64,7 +65,7 @@ def programs(config: Config, placed: State) -> Programs:
                     in_specs=(specs,),
                     out_specs=(specs, P(SEEDS)),
                     axis_names={SEEDS},
-                    check_vma=False,  # of foreign functions nothing is known
+                    check_vma=False,  # it cannot look into foreign functions
                 )
                 for f in functions
             )
@@ -79,7 +80,7 @@ def programs(config: Config, placed: State) -> Programs:
 
 
 def _specs(config: Config, of_rows: tuple[str, ...]) -> State:
-    """Every leaf's; environments and rows of the replay lie along the axes `of_rows`."""
+    """A spec for every leaf; environments and replay rows lie along the axes `of_rows`."""
     shapes = jax.eval_shape(lambda: algorithm.start(config))
     seeds = (SEEDS,) if config.num_seeds > 1 else ()
     of_seed, of_env = P(*seeds), P(*seeds, *of_rows)

@@ -1,9 +1,9 @@
-"""What the replay keeps of training: each state once, with its distances to the reference.
+"""What the replay stores: each state once, with its distances to the reference.
 
-An item is a step. It holds what the networks see of the state that the step reached, and points at
-the one that it left: the item of the step before or, for an episode's first, an entry of the pool
-of starts. Of copies, whole episodes turned by a yaw, only the angles and what is measured are
-stored: the states are turned when drawn.
+An item is a step. It holds the part of the reached state that the networks see, and an index to the
+state that the step left: the previous step's item or, at an episode's start, an entry of the pool
+of starts. Copies are whole episodes turned by a yaw. The replay stores their angles, features and
+distances, and turns the states when it draws them.
 """
 
 from typing import NamedTuple
@@ -18,34 +18,34 @@ from maxent_jax.sac.replay import Replay
 from maxent_jax.types import Distances, Experience, Outcomes, Transition
 
 POSITION_DIMS = 2  # the features that are metres, first in every feature map
-# Of a full ring's oldest items, those whose former state may have been overwritten: the items of
-# one step of all envs, and of the next if the ring's end parts them.
+# In a full ring the state that an item left may be overwritten. This concerns the oldest items:
+# those of one vector step, and of the next one if the ring's end lies within it.
 STEPS_WITHOUT_START = 2
 
 
 class Reference(NamedTuple):
-    """The states that define r_t; the first `num_filled` points are there."""
+    """The states that define r_t: the first `num_filled` points."""
 
     points: jax.Array  # [M, F]
     num_filled: jax.Array  # [] int32
 
 
 class Step(NamedTuple):
-    """An item of the replay; V = 1 + yaw copies variants of a step, the first unturned."""
+    """An item of the replay, in V = 1 + yaw_copies variants, of which the first is not turned."""
 
     state: jax.Array  # [num_seen] of the state reached, float32 or float16
-    features: jax.Array  # [V, F] of it, float32
+    features: jax.Array  # [V, F] of the state reached, float32
     previous: jax.Array  # [] int32: the item with the state left, or -1 - its row in the starts
-    following: jax.Array  # [] int32: the episode's next item, -1 where there is none
+    following: jax.Array  # [] int32: the episode's next item, -1 if there is none
     action: jax.Array  # [A]
     terminated: jax.Array  # [] bool
     bonus: jax.Array  # [] episodic term, feature units
-    angle: jax.Array | None  # [V - 1] radians, an episode's own; None without copies
+    angle: jax.Array | None  # [V - 1] radians, the same throughout an episode; None without copies
     distances: Distances  # [V]
 
 
 def init(components: Components) -> Replay:
-    """An empty replay."""
+    """Returns an empty replay."""
     config = components.config
     scalar, variants = jnp.zeros(()), jnp.zeros(1 + config.learner.yaw_copies)
     step = Step(
@@ -71,12 +71,15 @@ def add(
     bonus: jax.Array,
     key: jax.Array,
 ) -> tuple[Replay, jax.Array]:
-    """The replay with the valid transitions [N, ...] in it, and the rows where they went, [N].
+    """Adds the valid transitions to the replay.
 
     Args:
-      previous: [N] as in Step.
-      bonus: [N].
-      key: for the yaw of the copies of episodes that begin.
+      transition: [N, ...] one step of each environment.
+      previous: [N] int32, as in Step.
+      bonus: [N] episodic term, feature units.
+      key: draws the yaw of the copies of episodes that begin.
+    Returns:
+      The replay, and [N] int32 the rows of the new items; beyond the end for invalid ones.
     """
     config = components.config
     angle = None
@@ -109,12 +112,13 @@ def add(
 def sample(
     components: Components, ring: Replay, starts: jax.Array, shape: tuple[int, ...], key: jax.Array
 ) -> Experience:
-    """Drawn uniformly with replacement: [*shape, ...] items, with the steps that follow each.
-
-    Of observations, what the networks see: [*shape, num_seen].
+    """Draws items uniformly with replacement, each with the steps that follow it.
 
     Args:
       starts: [R, D] the pool of states from which the episodes began.
+      shape: of the draw.
+    Returns:
+      [*shape, ...]; observations are the part that the networks see, [*shape, num_seen].
     """
     config = components.config
     key_rows, key_variant = jax.random.split(key)
@@ -163,7 +167,7 @@ def sample(
 def measure_all(
     components: Components, reference: Reference, ring: Replay, starts: jax.Array
 ) -> Replay:
-    """The replay with all its distances measured anew."""
+    """Measures all distances in the replay again, from the pool of `starts` [R, D]."""
     items: Step = ring.items
     every = jnp.arange(items.previous.shape[0])
     before = _features_left(components, items, starts, every)
@@ -174,7 +178,14 @@ def measure_all(
 def measure(
     components: Components, reference: Reference, before: jax.Array, after: jax.Array
 ) -> Distances:
-    """Distances [...] of transitions whose ends have those features, [..., F] each."""
+    """Measures the distances of transitions from the features of their ends.
+
+    Args:
+      before: [..., F] features of the state left.
+      after: [..., F] features of the state reached.
+    Returns:
+      [...] each, feature units.
+    """
     config = components.config
 
     def distance(features):
@@ -197,7 +208,7 @@ def measure(
 
 
 def _address(previous: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Whether an item stands before, its row if so, and the row in the starts if not."""
+    """Whether a previous item exists, its row if so, and the row in the starts if not."""
     return previous >= 0, jnp.maximum(previous, 0), jnp.maximum(-1 - previous, 0)
 
 
@@ -230,7 +241,7 @@ def _rotated(components: Components, state: jax.Array, angle: jax.Array) -> jax.
 
 
 def _chosen(values: jax.Array, index: jax.Array, axis: int = -1) -> jax.Array:
-    """The entry of that index along an axis, which goes."""
+    """The entry at `index` along `axis`, which is dropped."""
     return jnp.take_along_axis(values, jnp.expand_dims(index, axis), axis).squeeze(axis)
 
 

@@ -1,13 +1,12 @@
-"""Algorithm 1, for every method: pure functions from state to state.
+"""Algorithm 1 for every method: pure functions from state to state.
 
     begin          roll the mixture out, define r_t from it, choose the agent to start from
     train_segment  a fixed number of env steps with their updates; archives a snapshot if one is due
     end            archive the agent, evaluate the mixture
 
-`iterate` composes them and `run` scans `iterate` as one program; a driver that logs and saves in
-between calls the same three, and may end an iteration at a plateau (convergence.py), which a
-program that spends its whole budget cannot. A method is data in the state, so all methods share
-one program.
+`iterate` composes them, and `run` scans `iterate` as one program. A driver that logs and saves in
+between calls the same three functions. Only a driver can end an iteration at a plateau
+(convergence.py). A method is data in the state, so all methods share one program.
 """
 
 import functools
@@ -33,33 +32,33 @@ from maxent_jax.sac import agent
 from maxent_jax.sac.agent import Agent
 from maxent_jax.types import Metrics
 
-EVALUATION_SEED = 0  # rollouts that measure the mixture use the same randomness every time
+EVALUATION_SEED = 0  # the mixture is measured with the same randomness every time
 
 
 class State(NamedTuple):
     """All that the next step needs."""
 
     key: jax.Array  # typed
-    iteration: jax.Array  # [] int32, iterations completed
+    iteration: jax.Array  # [] int32, completed iterations
     method: methods.Method
     archive: Archive
     learner: Learner
 
 
-# With seeds side by side every leaf has a leading axis [S, ...], but for the method, which they
-# share: jax.vmap(f, (SEED_AXES,), SEED_AXES) for f: State -> State.
+# With several seeds every leaf has a leading axis [S, ...], except the method, which all share:
+# jax.vmap(f, (SEED_AXES,), SEED_AXES) for f: State -> State.
 SEED_AXES = State(key=0, iteration=0, method=None, archive=0, learner=0)  # type: ignore[arg-type]
 
 
 @in_32_bits
 def init(config: Config, key: jax.Array) -> State:
-    """Before the first iteration: π_0, untrained, is the whole mixture."""
+    """Returns the state before the first iteration: the mixture is π_0, which is untrained."""
     return _init(config.program(), methods.make(config), key)
 
 
 @in_32_bits
 def start(config: Config) -> State:
-    """The first state of all the config's seeds, with a seed axis if they are more than one."""
+    """Returns the first state of the config's seeds; [S, ...] if there are several."""
     if config.num_seeds == 1:
         return init(config, jax.random.key(config.seed))
     seeds = config.seed + jnp.arange(config.num_seeds)
@@ -77,7 +76,7 @@ def _init(config: Config, method: methods.Method, key: jax.Array) -> State:
 
 
 def shapes(config: Config) -> State:
-    """The shape and dtype of every leaf of a seed's first state; nothing is computed."""
+    """Returns the shape and dtype of each leaf of one seed's first state, computing nothing."""
     table = jax.ShapeDtypeStruct((config.archive_size, config.archive_size), jnp.float32)
     number = jax.ShapeDtypeStruct((), jnp.int32)
     flag = jax.ShapeDtypeStruct((), jnp.bool_)
@@ -88,7 +87,7 @@ def shapes(config: Config) -> State:
 
 @in_32_bits
 def begin(config: Config, state: State) -> tuple[State, Metrics]:
-    """Steps 1 to 3 of Algorithm 1, and the start of step 4."""
+    """Runs steps 1 to 3 of Algorithm 1, and chooses the agent with which step 4 starts."""
     p = components.make(config)
     learner, archive, method = state.learner, state.archive, state.method
     key, *keys = jax.random.split(state.key, 6)
@@ -99,7 +98,7 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
     visited = occupancy.of_mixture(p, archive, weights, starts, key_rollout)
     visited, weights = occupancy.corrected(p, visited, weights)
 
-    # Before there is a history, the first rollouts stand in for one.
+    # While the history is empty, the first rollouts take its place.
     unseen = (learner.history.seen == 0) & visited.alive
     history = reservoir.add(learner.history, visited.features, unseen, key_history)
     rows = mixture.draw_rows(visited.weight, config.mixture.reference_size, key_rows)
@@ -125,7 +124,7 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
         "num_rollout_steps": jnp.sum(visited.alive, dtype=jnp.int32),
         "num_rollout_invalid": visited.num_invalid,
     }
-    if p.config.mixture.mixing == "episode":  # else no state is a policy's
+    if p.config.mixture.mixing == "episode":  # otherwise no state belongs to one policy
         metrics |= {
             "best_policy": best,
             "policy_return": scores.episode_return,
@@ -136,9 +135,9 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
 
 @in_32_bits
 def train_segment(config: Config, state: State) -> tuple[State, Metrics]:
-    """`config.vector_steps` steps of all envs with their gradient steps (step 4).
+    """Trains for `config.vector_steps` vector steps with their gradient steps (step 4).
 
-    Afterwards archives a snapshot of the agent if one is due.
+    Archives a snapshot of the agent afterwards, if one is due.
     """
     p = components.make(config)
 
@@ -155,7 +154,7 @@ def train_segment(config: Config, state: State) -> tuple[State, Metrics]:
 
 
 def _due(config: Config, learner: Learner) -> jax.Array:
-    """Whether a snapshot is taken after this segment; that of an iteration's last is `end`'s."""
+    """Whether to archive a snapshot after this segment; `end` archives after the last one."""
     segments = learner.env_steps // (config.vector_steps * config.budget.num_envs)
     within = segments % config.budget.num_segments
     return (within > 0) & (within % (config.budget.num_segments // config.mixture.snapshots) == 0)
@@ -163,7 +162,7 @@ def _due(config: Config, learner: Learner) -> jax.Array:
 
 @in_32_bits
 def end(config: Config, state: State) -> tuple[State, Metrics]:
-    """Archives the agent, and measures what has been reached."""
+    """Archives the agent, then measures the mixture and the coverage so far."""
     p = components.make(config)
     learner = state.learner
     archive = mixture.append(state.archive, agent.archived(learner.agent))
@@ -179,7 +178,7 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
 
     if (
         p.config.mixture.weights == CORRECTIVE
-    ):  # fitted to other episodes than those that are measured
+    ):  # fit the weights to other episodes than those that are measured
         fitted_to = roll_out(weights, *jax.random.split(jax.random.key(EVALUATION_SEED + 1)))
         _, weights = occupancy.corrected(p, fitted_to, weights)
     visited = roll_out(weights, key_starts, key_rollout)
@@ -199,7 +198,7 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
 
 @in_32_bits
 def iterate(config: Config, state: State) -> tuple[State, Metrics]:
-    """One iteration of Algorithm 1."""
+    """Runs one iteration of Algorithm 1."""
     state, at_begin = begin(config, state)
     state, in_segments = jax.lax.scan(
         lambda s, _: train_segment(config, s), state, length=config.budget.num_segments
@@ -210,12 +209,12 @@ def iterate(config: Config, state: State) -> tuple[State, Metrics]:
 
 @in_32_bits
 def run(config: Config, state: State, num_iterations: int) -> tuple[State, Metrics]:
-    """That many iterations as one program; metrics [T, ...]. Jit it with the state donated."""
+    """Runs T iterations as one program; metrics are [T, ...]. Jit it with the state donated."""
     return jax.lax.scan(lambda s, _: iterate(config, s), state, length=num_iterations)
 
 
 class Programs(NamedTuple):
-    """The three functions of an iteration, State -> State and Metrics; compiled, state donated."""
+    """The three functions of an iteration, State -> (State, Metrics)."""
 
     begin: Callable[[State], tuple[State, Metrics]]
     train_segment: Callable[[State], tuple[State, Metrics]]
@@ -223,7 +222,7 @@ class Programs(NamedTuple):
 
 
 def programs(config: Config) -> Programs:
-    """What a driver calls to log and save in between; compiled once for each program."""
+    """Returns the jitted functions for a driver that logs and saves in between; state donated."""
     return _programs(config.program(), config.num_seeds > 1)
 
 
@@ -234,7 +233,7 @@ def _programs(config: Config, seed_axis: bool) -> Programs:
 
 @functools.lru_cache(maxsize=8)
 def compiled(config: Config, jitted: Programs) -> Programs:
-    """The three compiled for the config's state, at the same time."""
+    """Compiles the three functions for the config's state, in parallel."""
     state = jax.eval_shape(functools.partial(start, config))
 
     def compile_one(function: Any) -> Callable:
@@ -245,7 +244,7 @@ def compiled(config: Config, jitted: Programs) -> Programs:
 
 
 def functions(config: Config, seed_axis: bool) -> Programs:
-    """The three functions of an iteration, not compiled; with an axis of seeds if asked."""
+    """Returns the three functions of an iteration, not jitted; mapped over seeds if asked."""
     parts_of_it = (functools.partial(f, config) for f in (begin, train_segment, end))
     if not seed_axis:
         return Programs(*parts_of_it)
@@ -253,7 +252,7 @@ def functions(config: Config, seed_axis: bool) -> Programs:
 
 
 def reduce_metrics(metrics: Metrics) -> Metrics:
-    """Over the leading axis: counts, named num_, are summed; the rest is averaged."""
+    """Reduces the leading axis: sums the counts, whose names begin with num_; averages the rest."""
     return {
         name: jnp.sum(value, 0) if name.startswith("num_") else jnp.mean(value, 0)
         for name, value in metrics.items()
@@ -268,7 +267,7 @@ def _start(
     best: jax.Array,
     key: jax.Array,
 ) -> Agent:
-    """The agent that the iteration starts from, as STARTS says."""
+    """The agent that the iteration starts from: one of STARTS."""
     scratch = agent.init(p.sac, key)
     restored = agent.restart(p.sac, mixture.policy(archive, best))
     candidates = dict(scratch=scratch, last=last, best=restored)
@@ -281,7 +280,7 @@ def _start(
 
 
 def coverage(of: str, visits: training.Visits) -> Metrics:
-    """Cells, entropy (nats) and share off the grid of all states met, by whose they are."""
+    """Returns coverage (cells), entropy (nats) and off-grid share; `of` begins each name."""
     on_grid = jnp.sum(visits.cells)
     return {
         f"{of}_coverage": histogram.coverage(visits.cells),

@@ -1,4 +1,4 @@
-"""A method as arrays. The algorithm reads these, and knows no method by name.
+"""A method as arrays: the algorithm reads these and knows no method by name.
 
 The methods are the rows of `config.registry.METHODS`.
 """
@@ -14,7 +14,7 @@ from maxent_jax.config.registry import BY_METHOD, STARTS, MethodRow
 
 
 class Method(NamedTuple):
-    """A method in numbers: part of the state, so that one compiled program runs them all."""
+    """A method in numbers, part of the state, so that one compiled program runs every method."""
 
     weights: jax.Array  # [P, P] float32, see mixture.weight_table
     refresh_period: jax.Array  # [] int32, as in MethodRow
@@ -23,7 +23,7 @@ class Method(NamedTuple):
 
 
 def row(config: Config) -> MethodRow:
-    """The method's row, with the choices that the config makes itself in their place."""
+    """Returns the method's row, with the config's own choices where it makes any."""
     of_method, own = registry.method(config.method), config.mixture
     period = own.refresh_period
     return MethodRow(
@@ -35,7 +35,7 @@ def row(config: Config) -> MethodRow:
 
 
 def make(config: Config) -> Method:
-    """The arrays of the config's method."""
+    """Returns the config's method as arrays."""
     chosen = row(config)
     return Method(
         weights=jnp.asarray(

@@ -1,4 +1,4 @@
-"""One step of all envs with its gradient steps, against the reward of the moment."""
+"""One vector step with its gradient steps, under the current reward."""
 
 from typing import Any, NamedTuple
 
@@ -22,11 +22,11 @@ from maxent_jax.sac.agent import Agent
 from maxent_jax.sac.replay import Replay
 from maxent_jax.types import Experience, Metrics, Outcomes, Transition
 
-SMALLEST_SIZE = 1e-8  # of a bonus, as a standard deviation
+SMALLEST_SIZE = 1e-8  # standard deviation by which a bonus is divided
 
 
 class Visits(NamedTuple):
-    """Every state met, as counts; they only grow."""
+    """Counts of every state visited so far."""
 
     cells: jax.Array  # [bins, bins] int32
     off_grid: jax.Array  # [] int32
@@ -38,7 +38,7 @@ class Learner(NamedTuple):
     agent: Agent
     replay: Replay
     place: jax.Array  # [N] int32, where the replay finds each env's state: see experience.Step
-    episodes: Episodes  # [N] of the agent; then, with the random baseline, [N] of that
+    episodes: Episodes  # [N] of the agent, then [N] of the random baseline if there is one
     memory: jax.Array | None  # [N, T, F] states of each episode so far, for an episodic term
     bonus: Any  # the bonus's state; None without one
     reference: Reference
@@ -50,7 +50,7 @@ class Learner(NamedTuple):
 
 
 def init(components: Components, key: jax.Array) -> Learner:
-    """A fresh learner with fresh episodes, an empty replay, and no reference yet."""
+    """Returns a new learner with new episodes, an empty replay and an empty reference."""
     config, sac = components.config, components.sac
     key_agent, key_episodes, key_bonus = jax.random.split(key, 3)
     num_rows = config.budget.num_envs * (2 if config.evaluation.random_baseline else 1)
@@ -82,7 +82,7 @@ def init(components: Components, key: jax.Array) -> Learner:
 def step(
     components: Components, method: Method, learner: Learner, key: jax.Array
 ) -> tuple[Learner, Metrics]:
-    """All envs once, then the gradient steps that go with it. Metrics named num_ are counts."""
+    """Steps all envs once, then takes the gradient steps; metrics named num_ are counts."""
     config = components.config
     key_act, key_random, key_env, key_history, key_yaw, key_learn = jax.random.split(key, 6)
 
@@ -139,7 +139,7 @@ def step(
 
 
 def unshaped_reward(components: Components, distance: jax.Array) -> jax.Array:
-    """r_t of a state at that distance, [...] -> [...]: what scores and plots use."""
+    """Returns r_t of states at a distance, [...] -> [...], for scores and plots."""
     config = components.config
     return rewards.of_distance(
         distance,
@@ -150,7 +150,7 @@ def unshaped_reward(components: Components, distance: jax.Array) -> jax.Array:
 
 
 def reward(components: Components, outcomes: Outcomes) -> jax.Array:
-    """What SAC is paid for each step, [...]: r_t, shaping, the episodic term, and for living."""
+    """Returns the reward that SAC receives, [...]: r_t, shaping, episodic term, alive bonus."""
     own, distances = components.config.intrinsic, outcomes.distances
     paid = unshaped_reward(components, distances.reached) + own.episodic_weight * outcomes.bonus
     if own.shaping > 0:
@@ -172,12 +172,12 @@ def _for_living(components: Components, outcomes: Outcomes) -> jax.Array:
 
 
 def returns(outcomes: Outcomes, paid: jax.Array, discount: float) -> tuple[jax.Array, jax.Array]:
-    """The discounted sum of what was paid, [...], and the factor on γ V(s') beyond, [...].
+    """Returns the discounted n-step reward [...], and the factor [...] on γ V(s') after it.
 
-    With n steps the entropy of the policy counts from the last state on, as usual in n-step SAC.
+    The entropy of the policy counts from the last state on, as usual in n-step SAC.
 
     Args:
-      paid: [..., n].
+      paid: [..., n] the reward of each step.
       discount: γ.
     """
     taken = outcomes.taken.astype(jnp.float32)
@@ -190,10 +190,8 @@ def returns(outcomes: Outcomes, paid: jax.Array, discount: float) -> tuple[jax.A
 def _refreshed(
     components: Components, method: Method, learner: Learner, history: Reservoir
 ) -> Reference:
-    """The reference, drawn anew where the method's period says so.
-
-    The mixture's own states change only between iterations, see algorithm.begin.
-    """
+    """The reference, refreshed from the history where the method's period says so."""
+    # The mixture's states change only between iterations, see algorithm.begin.
     vector_step = learner.env_steps // components.config.budget.num_envs
     period = method.refresh_period
     due = _changes_within_iteration(method) & (vector_step % jnp.maximum(period, 1) == 0)
@@ -208,7 +206,7 @@ def _changes_within_iteration(method: Method) -> jax.Array:
 
 
 def _episodic(components, learner, transition: Transition, features, age):
-    """The bonus, the memory with the states left behind, and the episodic term of those reached."""
+    """The bonus, the memory with the states left, and the episodic term of the states reached."""
     config, bonus, memory = components.config, learner.bonus, learner.memory
     if memory is None:
         return bonus, memory, jnp.zeros(config.budget.num_envs)
@@ -225,7 +223,14 @@ def _episodic(components, learner, transition: Transition, features, age):
 
 
 def visit(components: Components, visits: Visits, states: jax.Array, counts: jax.Array) -> Visits:
-    """With the states [B, D] that count, [B] bool."""
+    """Adds states to the counts.
+
+    Args:
+      states: [B, D] states.
+      counts: [B] bool, the states that count.
+    Returns:
+      The new counts.
+    """
     number = counts.astype(jnp.int32)
     cells = histogram.count(states, components.grid, number)
     return Visits(visits.cells + cells, visits.off_grid + jnp.sum(number) - jnp.sum(cells))
@@ -234,14 +239,14 @@ def visit(components: Components, visits: Visits, states: jax.Array, counts: jax
 def _learn(
     components: Components, method: Method, learner: Learner, key: jax.Array
 ) -> tuple[Learner, Metrics]:
-    """The gradient steps of one step of all envs, on rewards of the current reference."""
+    """The gradient steps of one vector step, on rewards of the current reference."""
     config = components.config
     shape = (config.updates_per_vector_step, config.learner.batch_size)
     key_sample, key_update = jax.random.split(key)
     drawn = experience.sample(
         components, learner.replay, learner.episodes.starts.obs, shape, key_sample
     )
-    # Stored distances hold while the reference does; the branch touches the drawn rows alone.
+    # Stored distances stay valid while the reference does; the branch touches only drawn rows.
     distances = jax.lax.cond(
         _changes_within_iteration(method) & (not config.intrinsic.stale_rewards),
         lambda x: experience.measure(components, learner.reference, x.features, x.next_features),
@@ -275,12 +280,9 @@ def _learn(
 def _paid_by_bonus(
     components: Components, learner: Learner, drawn: Experience, key: jax.Array
 ) -> tuple[Any, jax.Array, Metrics]:
-    """The bonus once it has learned from what was drawn, what it paid for it before, [..., 1], and
-    what it says of itself.
-
-    It sees features, as every other reward does. What it pays is divided by its standard deviation
-    over all that was drawn: methods say nothing of a scale, which SAC's temperature needs.
-    """
+    """The bonus after learning from the draw, its reward before learning [..., 1], and metrics."""
+    # It sees features, as every other reward does. Its reward is divided by the standard deviation
+    # over the draw: methods prescribe no scale, but SAC's temperature needs one.
     payer = components.bonus
     assert payer is not None
     key_value, key_learn = jax.random.split(key)
@@ -314,7 +316,7 @@ def _cells(components: Components, states: jax.Array) -> jax.Array:
 
 
 def refresh_bonus(components: Components, bonus: Any, visited: Occupancy) -> Any:
-    """The bonus with the states that the mixture visits, where it asks for them."""
+    """Gives the bonus the cells that the mixture visits, if it uses them."""
     if components.bonus is None or components.bonus.refresh is None:
         return bonus
     return components.bonus.refresh(

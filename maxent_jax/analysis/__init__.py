@@ -1,4 +1,4 @@
-"""What a run has learned: its metrics, policies, fresh episodes, datasets and exported policies."""
+"""Access to a run's results: metrics, policies, fresh episodes, datasets, exported policies."""
 
 from maxent_jax.analysis.run import (
     Paths,

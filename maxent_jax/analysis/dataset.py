@@ -17,42 +17,44 @@ EPISODES_AT_ONCE = 32
 
 
 def check(config: Config, num: int) -> None:
-    """Whether that many transitions can be collected.
+    """Checks that `num` transitions can be collected.
 
     Raises:
-      ValueError: num < 1, or more than fit into memory.
+      ValueError: num < 1, or the transitions do not fit into memory.
     """
     if check_whole("n", num) < 1:
-        raise ValueError(f"a dataset has at least 1 transition, not {num}")
+        raise ValueError(f"a dataset needs at least 1 transition, not {num}")
     memory.check_rows(config, num, "transitions")
 
 
 def collect(
     components: Components, archive: Archive, weights: jax.Array, num: int, key: jax.Array
 ) -> dict[str, np.ndarray]:
-    """`num` transitions, episode by episode; each is played by one policy, drawn by weight.
+    """Collects n transitions, episode by episode; one policy, drawn by weight, plays each episode.
 
     | key               | shape, type   | what                                                     |
     |-------------------|---------------|----------------------------------------------------------|
     | observations      | [n, D] float32| the state left                                           |
-    | actions           | [n, A] float32| in [-1, 1], of the share `torque_limit` of the controls  |
+    | actions           | [n, A] float32| in [-1, 1]; ±1 is `torque_limit` times the control range |
     | next_observations | [n, D] float32| the state reached, also at an episode's end              |
-    | terminals         | [n] bool      | the state reached ended its episode: no return from there|
-    | timeouts          | [n] bool      | the episode was cut after it, see below                  |
-    | policy            | [n] int32     | who played                                               |
+    | terminals         | [n] bool      | the episode ended in the state reached: no return beyond |
+    | timeouts          | [n] bool      | the episode was cut after this step, see below           |
+    | policy            | [n] int32     | the policy that played                                   |
     | features          | [n, F] float32| phi of the state reached                                 |
 
-    An episode is cut at its time limit, before a step that leaves the finite numbers, and at the
-    last row. Every episode's last row is a terminal or a timeout, and no other row is either.
+    An episode is cut at its time limit, before a step whose state is not finite, and at the last
+    row. Every episode's last row is a terminal or a timeout, and no other row is either.
 
-    There is no reward, as there is none in the run. To give it one, rate the states reached, with
-    `rewards.knn_reward(features, ...)` or a task of your own on `next_observations`.
+    There is no reward, because the run has none. To add one, rate the states reached: use
+    `rewards.knn_reward(features, ...)`, or your own task on `next_observations`.
 
     Args:
-      weights: [P], of the policies.
-      num: n. Beside the rows, EPISODES_AT_ONCE episodes are in memory.
+      weights: [P] of the policies.
+      num: n. EPISODES_AT_ONCE episodes are in memory in addition to the rows.
+    Returns:
+      The arrays of the table.
     Raises:
-      ValueError: num < 1, or no episode has a first step.
+      ValueError: num < 1, the rows do not fit into memory, or no episode has a finite first step.
     """
     check(components.config, num)
     rows: dict[str, np.ndarray] = {}
@@ -64,7 +66,7 @@ def collect(
             rows = {name: np.empty((num, *x.shape[1:]), x.dtype) for name, x in found.items()}
         taken = min(num - filled, len(found["policy"]))
         if taken == 0:
-            raise ValueError(f"none of {EPISODES_AT_ONCE} episodes has a finite first step")
+            raise ValueError(f"none of the {EPISODES_AT_ONCE} episodes has a finite first step")
         for name, x in found.items():
             rows[name][filled : filled + taken] = x[:taken]
         filled += taken
@@ -76,12 +78,12 @@ def collect(
 def _episodes(
     components: Components, archive: Archive, weights: jax.Array, key: jax.Array
 ) -> tuple[dict[str, jax.Array], jax.Array]:
-    """[T, E, ...] of each key, and [T, E] bool: which are transitions at all."""
+    """[T, E, ...] of each key, and [T, E] bool: the entries that are transitions."""
     key_starts, key_assign, key_order, key_play = jax.random.split(key, 4)
     starts = jax.vmap(components.env.reset)(jax.random.split(key_starts, EPISODES_AT_ONCE))
     offset = jax.random.uniform(key_assign)
     policy = mixture.assign_episodes(weights, EPISODES_AT_ONCE, offset)
-    # The last ones may be cut off: they must not always be the newest policies'.
+    # The last episodes may be cut off, and must not always be those of the newest policies.
     policy = jax.random.permutation(key_order, policy)
     reached = occupancy.play(components, archive, policy, starts, key_play)
     goes_on = jnp.concatenate([reached.alive[1:], jnp.zeros_like(reached.alive[:1])])
@@ -98,6 +100,6 @@ def _episodes(
 
 
 def _in_order(rows: dict[str, jax.Array], there: jax.Array) -> dict[str, np.ndarray]:
-    """[R, ...] of each key: one episode after the other."""
+    """[R, ...] of each key, one episode after the other."""
     mask = np.asarray(there).T
     return {name: np.asarray(x).swapaxes(0, 1)[mask] for name, x in rows.items()}

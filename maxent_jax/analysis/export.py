@@ -1,4 +1,4 @@
-"""A policy as a program of its own, which runs where this package is not installed."""
+"""Exports a policy as a program that runs without this package."""
 
 import jax
 import jax.numpy as jnp
@@ -11,15 +11,16 @@ PLATFORMS = ("cpu", "cuda", "tpu")
 
 
 def policy(sac: Sac, policy: Policy, deterministic: bool = False) -> export.Exported:
-    """A policy with its weights, for any number of states, on any of PLATFORMS.
+    """Exports a policy with its weights, for any number of states, to any of PLATFORMS.
 
-    Its `call` takes (states [b, D] float32, a typed key), or states alone if it is deterministic,
-    and gives actions [b, A] in [-1, 1]. `serialize()` gives bytes; `jax.export.deserialize` reads
-    them where there are flatbuffers and this jax or, as jax promises for six months, a newer one.
+    The result's `call` takes (states [b, D] float32, typed key), or only states if it is
+    deterministic, and returns actions [b, A] in [-1, 1]. `serialize()` gives bytes, which
+    `jax.export.deserialize` reads. That needs flatbuffers and this version of jax, or a newer one;
+    jax promises compatibility for six months.
 
     Args:
-      policy: its weights, and the moments of its inputs.
-      deterministic: the action at the mean of the Gaussian before the tanh, not one that is drawn.
+      policy: the weights, and the moments of the inputs.
+      deterministic: return the tanh of the Gaussian's mean instead of a draw.
     """
     states = jax.ShapeDtypeStruct((*export.symbolic_shape("b"), sac.observation_size), jnp.float32)
     key = jax.ShapeDtypeStruct((), jax.random.key(0).dtype)

@@ -1,4 +1,4 @@
-"""A run's policies in Gymnasium's own environments, and how far these lead from our simulator's."""
+"""Plays a run's policies in Gymnasium's environments, and compares with our simulator."""
 
 import warnings
 from collections.abc import Callable
@@ -15,15 +15,14 @@ from maxent_jax.config import Config
 from maxent_jax.errors import ConfigError
 
 IDS = {"ant": "Ant-v4", "walker2d": "Walker2d-v4", "humanoid": "Humanoid-v4"}
-NUM_SETS = 5  # sets of our own episodes, whose differences are chance alone
+NUM_SETS = 5  # sets of episodes in our simulator, which differ by chance alone
 
 
 class RunTask(gymnasium.Wrapper):
-    """Gymnasium's environment as a run's policies know it.
+    """Gymnasium's environment with the actions and states of a run's policies.
 
-    Actions lie in [-1, 1] and span the run's share of the control range, states are float32, and an
-    episode also ends upside down where the run says so. Starts, physics, health and reward are
-    Gymnasium's.
+    Actions in [-1, 1] span the run's share of the control range, and states are float32. An episode
+    also ends upside down if the run's do. Starts, physics, health and reward are Gymnasium's.
     """
 
     def __init__(self, env: gymnasium.Env, config: Config):
@@ -44,12 +43,12 @@ class RunTask(gymnasium.Wrapper):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """A start of Gymnasium's."""
+        """Resets Gymnasium's environment; returns the state [D] and its info."""
         observation, info = self.env.reset(seed=seed, options=options)
         return observation.astype(np.float32), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One control step."""
+        """Takes one control step with the action [A] in [-1, 1]; returns the state [D] first."""
         control = self._control_center + self._control_span * np.clip(np.float64(action), -1, 1)
         observation, reward, terminated, truncated, info = self.env.step(control)
         state = observation.astype(np.float32)
@@ -61,15 +60,15 @@ class Gap(NamedTuple):
 
     ours: float  # mean over NUM_SETS sets of episodes
     gymnasium: float  # of one set
-    difference: float  # Gymnasium's less ours
-    chance: float  # between two sets of our own, root mean square
+    difference: float  # Gymnasium's minus ours
+    chance: float  # root mean square difference between two sets in our simulator
 
 
 def make(config: Config) -> RunTask:
-    """Gymnasium's environment of a run, with its time limit.
+    """Makes Gymnasium's environment for a run, with the run's time limit.
 
     Raises:
-      ConfigError: there is none, or Gymnasium cannot make it here.
+      ConfigError: Gymnasium has no such environment, or cannot make it on this machine.
     """
     if config.env not in IDS:
         raise ConfigError(f"{config.env} is not played in Gymnasium: only {', '.join(IDS)} are.")
@@ -92,14 +91,17 @@ def make(config: Config) -> RunTask:
 
 
 def play(run: Run, policies: ArrayLike, seed: int = 0) -> Paths:
-    """Episodes in Gymnasium, one after another.
+    """Plays episodes in Gymnasium, one after another.
 
     Args:
-      policies: [E] ascending, who plays each: `[2] * 5`, or for the mixture
+      policies: [E] ascending, the policy that plays each episode: `[2] * 5`, or for the mixture
         `mixture.assign_episodes(run.weights, 50, 0.5)`.
       seed: of Gymnasium's starts and of the actions.
+    Returns:
+      The paths of the E episodes.
     Raises:
-      ConfigError: as make. IndexError: no such policy.
+      ConfigError: as in `make`.
+      IndexError: there is no such policy.
     """
     policies = np.asarray(policies)
     env = make(run.config)
@@ -118,15 +120,15 @@ def play(run: Run, policies: ArrayLike, seed: int = 0) -> Paths:
 
 
 def rollout(run: Run, episodes_per_policy: int = 5, seed: int = 0) -> Paths:
-    """Run.rollout in Gymnasium: fresh episodes of each policy, as paths."""
+    """Plays fresh episodes of each policy in Gymnasium; the counterpart of `Run.rollout`."""
     return play(run, np.repeat(np.arange(run.num_policies), episodes_per_policy), seed)
 
 
 def gap(run: Run, episodes_per_policy: int = 5, seed: int = 0) -> dict[str, Gap]:
-    """How the same policies do in Gymnasium and in our simulator, by measure.
+    """Compares each measure of the same policies in Gymnasium and in our simulator.
 
-    Gymnasium plays one set of episodes, and our simulator NUM_SETS as large ones. A difference
-    that is no larger than `chance` is one that two sets of our own have too.
+    Gymnasium plays one set of episodes, and our simulator NUM_SETS sets of the same size. Two sets
+    in our simulator also differ by about `chance`, so a smaller difference means nothing.
     """
     seeds = range(seed, seed + NUM_SETS)
     theirs = measures(run, rollout(run, episodes_per_policy, seed), seed)
@@ -135,7 +137,7 @@ def gap(run: Run, episodes_per_policy: int = 5, seed: int = 0) -> dict[str, Gap]
 
 
 def measures(run: Run, episodes: Paths, seed: int = 0) -> dict[str, float]:
-    """Run.measures of these episodes, and how far from its start each policy ends."""
+    """Returns `Run.measures` of these episodes, and the distance from start to end by policy."""
     distances = analysis.mean_end_distances(run, episodes)
     named = {f"policy_{i}_end_distance": float(x) for i, x in enumerate(distances)}
     return run.measures(run.occupancy_of(episodes), seed) | named
@@ -144,7 +146,7 @@ def measures(run: Run, episodes: Paths, seed: int = 0) -> dict[str, float]:
 def _episode(
     env: RunTask, act: Callable[[np.ndarray, jax.Array], jax.Array], keys: jax.Array
 ) -> np.ndarray:
-    """[L, D]: the states reached, to the episode's end."""
+    """[L, D]: the states reached, up to the episode's end."""
     reached = []
     state, _ = env.reset()
     for key in keys:

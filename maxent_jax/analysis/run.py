@@ -1,4 +1,4 @@
-"""A finished or running run, loaded to be looked at."""
+"""Loads a finished or running run for analysis."""
 
 import dataclasses
 import functools
@@ -35,12 +35,12 @@ class Paths(NamedTuple):
     """Episodes of single policies."""
 
     states: np.ndarray  # [E, T, D]
-    alive: np.ndarray  # [E, T] bool: the state was reached before the episode's end
+    alive: np.ndarray  # [E, T] bool: reached before the episode's end
     policy: np.ndarray  # [E] int, ascending
 
 
 class Summary(NamedTuple):
-    """What a policy does in fresh episodes, under the reward that the mixture defines."""
+    """A policy's results in fresh episodes, under the reward that the mixture defines."""
 
     policy: int
     weight: float
@@ -52,24 +52,24 @@ class Summary(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """One seed of a run. `metrics` are columns with one entry an iteration, [T] or [T, ...]."""
+    """One seed of a run; `metrics` are columns with one entry per iteration, [T] or [T, ...]."""
 
     path: Path
     config: Config
     metrics: dict[str, np.ndarray]
     seed: int
     mixture: Archive
-    histogram: np.ndarray  # [bins, bins] states met in training
-    random_histogram: np.ndarray  # [bins, bins] states met by the random policy beside it
+    histogram: np.ndarray  # [bins, bins] states visited in training
+    random_histogram: np.ndarray  # [bins, bins] states visited by the random baseline
 
     @property
     def num_policies(self) -> int:
-        """Policies in the mixture, the untrained one included."""
+        """Number of policies in the mixture, the untrained one included."""
         return int(self.mixture.size)
 
     @property
     def weights(self) -> np.ndarray:
-        """[P] of the mixture's policies, 0 for empty slots."""
+        """Weights [P] of the mixture's policies, 0 for empty slots."""
         if self.config.mixture.weights == CORRECTIVE and len(
             self.metrics.get("mixture_weights", ())
         ):
@@ -82,12 +82,12 @@ class Run:
         return components.make(self.config)
 
     def frame(self) -> "DataFrame":
-        """The metrics as a pandas frame: a row an iteration, a column a number.
+        """Returns the metrics as a pandas frame, with one row per iteration.
 
-        A metric of more numbers has a column for each, `weights_0`, `weights_1`, ...
+        A metric with several numbers has a column for each: `weights_0`, `weights_1`, ...
 
         Raises:
-          ImportError: there is no pandas.
+          ImportError: pandas is not installed.
         """
         try:
             from pandas import DataFrame
@@ -97,23 +97,24 @@ class Run:
 
     @in_32_bits
     def features(self, states: jax.Array | np.ndarray) -> jax.Array:
-        """phi(s), where distances are taken: [..., D] -> [..., F]; see `components.phi.names`."""
+        """Returns phi(s), [..., D] -> [..., F]; `components.phi.names` names the features."""
         return self.components.phi(jnp.asarray(states))
 
     def policy(self, index: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
-        """Policy `index` as a function: state [..., D], key -> action [..., A] in [-1, 1].
+        """Returns a policy as a function: state [..., D], key -> action [..., A] in [-1, 1].
+
+        The function raises ValueError if a state is not [..., D].
 
         Raises:
-          IndexError: no such policy.
-        The function raises ValueError where a state is not [..., D].
+          IndexError: there is no policy `index`.
         """
         return functools.partial(_act, self.components, self._policy(index))
 
     @in_32_bits
     def act(self, s: jax.Array, key: jax.Array, policy: int | None = None) -> jax.Array:
-        """Actions [..., A] for states [..., D] by one policy, drawn by weight unless named.
+        """Draws actions [..., A] for states [..., D] by `policy`, or by one drawn by weight.
 
-        The mixture keeps the policy that it has drawn for a whole episode: to play it, draw once.
+        The mixture draws a policy once per episode. To play it, draw one and use `Run.policy`.
         """
         key_draw, key_act = jax.random.split(key)
         if policy is None:
@@ -121,19 +122,19 @@ class Run:
         return self.policy(policy)(s, key_act)
 
     def export_policy(self, index: int, deterministic: bool = False) -> Exported:
-        """Policy `index` for use without this package: see export.policy for how it is called.
+        """Exports a policy for use without this package; see `export.policy` for how to call it.
 
         Raises:
-          IndexError: no such policy.
+          IndexError: there is no policy `index`.
         """
         return export.policy(self.components.sac, self._policy(index), deterministic)
 
     @in_32_bits
     def occupancy(self, episodes_per_policy: int = 5, seed: int = 0) -> Occupancy:
-        """Fresh episodes of each policy, with each state's share of the mixture's occupancy.
+        """Plays fresh episodes of each policy, and weighs the states as the mixture does.
 
         Raises:
-          ValueError: episodes_per_policy < 1, or more than fit into memory.
+          ValueError: episodes_per_policy < 1, or the episodes do not fit into memory.
         """
         check_whole("episodes_per_policy", episodes_per_policy, least=1)
         memory.check_episodes(self.config, episodes_per_policy * self.num_policies)
@@ -146,15 +147,15 @@ class Run:
 
     @in_32_bits
     def occupancy_of(self, episodes: Paths) -> Occupancy:
-        """The same of episodes that were played elsewhere, at least one of each policy.
+        """Makes the occupancy of given episodes, at least one of each policy.
 
         Raises:
-          ValueError: a policy without an episode, or one that is not in the mixture.
+          ValueError: a policy has no episode, or an episode's policy is not in the mixture.
         """
         played = set(np.unique(episodes.policy).tolist())
         if played != set(range(self.num_policies)):
             raise ValueError(
-                f"episodes are of the policies {sorted(played)}, but must be of all from 0 to "
+                f"episodes are of policies {sorted(played)}, but must be of all policies from 0 to "
                 f"{self.num_policies - 1}"
             )
         states = jnp.asarray(episodes.states).swapaxes(0, 1)
@@ -164,17 +165,17 @@ class Run:
         return _of_episodes(self._components_by_policy, weights, policy, states, alive, none)
 
     def rollout(self, episodes_per_policy: int = 5, seed: int = 0) -> Paths:
-        """Fresh episodes of each policy, as paths."""
+        """Plays fresh episodes of each policy and returns their paths."""
         return paths(self.occupancy(episodes_per_policy, seed))
 
     @in_32_bits
     def dataset(self, n: int, seed: int = 0) -> dict[str, np.ndarray]:
-        """`n` transitions of fresh episodes of the mixture, for offline reinforcement learning.
+        """Collects `n` transitions of the mixture's fresh episodes, for offline RL.
 
-        `np.savez_compressed(path, **run.dataset(n))` saves them. See dataset.collect for the keys.
+        `np.savez_compressed(path, **run.dataset(n))` saves them; `dataset.collect` lists the keys.
 
         Raises:
-          ValueError: n < 1, or more than fit into memory.
+          ValueError: n < 1, or the transitions do not fit into memory.
         """
         dataset.check(self.config, n)
         weights, key = jnp.asarray(self.weights), jax.random.key(seed)
@@ -182,14 +183,14 @@ class Run:
 
     @in_32_bits
     def scores(self, visited: Occupancy, seed: int = 0) -> Scores:
-        """Each policy's return under the reward that these states of the mixture define."""
+        """Scores each policy by its return under the reward that these states define."""
         rows = mixture.draw_rows(
             visited.weight, self.config.mixture.reference_size, jax.random.key(seed)
         )
         return _score(self.components, visited, visited.features[rows], rows, self.mixture)
 
     def summaries(self, visited: Occupancy, seed: int = 0) -> list[Summary]:
-        """One for each policy, of the episodes in `visited`."""
+        """Summarises the episodes in `visited`, policy by policy."""
         episodes, scores, weights = paths(visited), self.scores(visited, seed), self.weights
         ends = mean_ends(self, episodes)
         return [
@@ -206,13 +207,13 @@ class Run:
 
     @in_32_bits
     def measures(self, visited: Occupancy, seed: int = 0) -> dict[str, float]:
-        """Coverage and entropies of the mixture, named as in the metrics."""
+        """Measures the mixture's coverage and entropies (nats), named as in the metrics."""
         measured = occupancy.measures(self.components, visited, jax.random.key(seed))
         return {name: value.item() for name, value in measured.items()}
 
     @property
     def _components_by_policy(self) -> Components:
-        """With which policies play equally often, and the states of each share its weight."""
+        """The components with which policies play equally often, whatever the config says."""
         return components.make(self.config.replace(pooled=False, mixing="episode"))
 
     def _policy(self, index: int) -> Policy:
@@ -239,7 +240,7 @@ _score = jax.jit(occupancy.score, static_argnums=0)
 
 
 def paths(visited: Occupancy) -> Paths:
-    """The episodes that an occupancy was made of."""
+    """Returns the episodes of an occupancy."""
     num_episodes = visited.episode_policy.shape[0]
     states = np.asarray(visited.states).reshape(-1, num_episodes, visited.states.shape[-1])
     alive = np.asarray(visited.alive).reshape(-1, num_episodes)
@@ -248,17 +249,19 @@ def paths(visited: Occupancy) -> Paths:
 
 @in_32_bits
 def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> Run:
-    """Loads the results of a run as of its last checkpoint; the replay stays on disk.
+    """Loads a run's results from its last checkpoint; the replay stays on disk.
 
     Args:
       path: the run's directory.
-      seed_index: which of the seeds that were trained side by side.
-      fallback: pass over damaged checkpoints, with a warning for each.
+      seed_index: the seed, counted from 0, in a run of several seeds.
+      fallback: skip damaged checkpoints, with a warning for each.
+    Returns:
+      The run.
     Raises:
-      RunError: not the directory of a run, or no such seed.
-      CheckpointError: no complete checkpoint.
-      CheckpointCorruptError: a file of it is not what was written.
-      TypeError: a path or an index of the wrong type.
+      RunError: `path` is not the directory of a run, or there is no such seed.
+      CheckpointError: there is no complete checkpoint.
+      CheckpointCorruptError: a file of the checkpoint differs from what was written.
+      TypeError: the path or the index has the wrong type.
     """
     directory = check_path("path", path)
     seed_index = check_whole("seed_index", seed_index)
@@ -288,13 +291,13 @@ def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> R
 
 
 def mean_ends(run: Run, episodes: Paths) -> np.ndarray:
-    """[P, 2]: the mean of where the episodes of each policy end, on the grid's axes."""
+    """Returns the mean end of each policy's episodes, [P, 2] on the grid's axes."""
     ends = _located_ends(run, episodes)
     return np.stack([ends[episodes.policy == i].mean(axis=0) for i in range(run.num_policies)])
 
 
 def mean_end_distances(run: Run, episodes: Paths) -> np.ndarray:
-    """[P]: how far from their first state the episodes of each policy end, on the grid's axes."""
+    """Returns the mean distance from first to last state by policy, [P] on the grid's axes."""
     distance = np.linalg.norm(
         _located_ends(run, episodes) - _locate(run, episodes.states[:, 0]), axis=1
     )
@@ -312,7 +315,7 @@ def _locate(run: Run, states: np.ndarray) -> np.ndarray:
 
 
 def _scalar_columns(metrics: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Metrics [T] as they are, and each entry of metrics [T, ...] by its name and indices."""
+    """Metrics [T] unchanged, and each entry of metrics [T, ...] under its name and indices."""
     columns = {}
     for name, values in metrics.items():
         for index in np.ndindex(values.shape[1:]):

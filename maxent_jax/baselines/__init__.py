@@ -1,1 +1,1 @@
-"""What the field compares with, as its authors published it: MEPOL, and Hazan et al. (2019)."""
+"""Baselines as their authors published them: MEPOL, and MaxEnt-H of Hazan et al. (2019)."""

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 
 def main() -> None:
-    """The entry point `maxent-jax`: the first argument names a command, which gets the others."""
+    """Runs `maxent-jax`: the first argument names a command, the others are its arguments."""
     from maxent_jax.commands import cli
 
     cli.entry_point(_dispatch)(sys.argv[1:])
@@ -19,7 +19,7 @@ def _dispatch(argv: Sequence[str]) -> None:
 
     known = cli.COMMANDS
     if not argv:
-        raise UsageError(f"name a command: {', '.join(known)} (--help says what each does).")
+        raise UsageError(f"no command is given: name one of {', '.join(known)} (see --help).")
     name, *arguments = argv
     if name in ("-h", "--help"):
         width = max(map(len, known))

@@ -1,4 +1,4 @@
-"""From a command line to settings: flags made from fields, one sentence for each mistake."""
+"""Parses command lines: flags are made from fields, and each mistake gives one sentence."""
 
 import dataclasses
 import functools
@@ -30,30 +30,30 @@ Arguments = TypeVar("Arguments")
 Modules = Annotated[
     tuple[str, ...], tyro.conf.arg(name="import", metavar="MODULE"), tyro.conf.UseAppendAction
 ]
-"""The type of a field for --import, which may be given more than once."""
+"""The type of a field for --import, which can be repeated."""
 COMMANDS = {
     "train": "train a mixture of policies that covers the state space",
-    "evaluate": "roll a run's mixture out anew: entropy, coverage, returns",
+    "evaluate": "roll out a run's mixture again: entropy, coverage, returns",
     "render": "film a run's policies",
-    "report": "one HTML page about one or several runs",
-    "verify": "is every file of a run's checkpoints what was written?",
-    "reproduce": "the paper's figures, and the studies beside them",
-    "theory": "the methods against their bounds, exactly, in tabular MDPs",
+    "report": "write an HTML page about one or several runs",
+    "verify": "compare a run's checkpoints with their checksums",
+    "reproduce": "reproduce the paper's figures, and run other studies",
+    "theory": "compare the methods with their bounds, exactly, in tabular MDPs",
 }
 
 
 def run(name: str) -> None:
-    """The entry point of the command of that name, with the arguments of this process."""
+    """Runs the command of that name with the arguments of this process."""
     entry_point(command(name))(sys.argv[1:])
 
 
 def command(name: str) -> Callable[[Sequence[str]], None]:
-    """The main of the command of that name."""
+    """Returns the main function of the command of that name."""
     return importlib.import_module(f"maxent_jax.commands.{name}").main
 
 
 def spelled(name: str) -> str:
-    """How a user types the command of that name: as the one that is running was typed."""
+    """Returns how to type a command, in the form in which the running one was typed."""
     started = Path(sys.argv[0])
     if started.stem == "maxent-jax":
         return f"maxent-jax {name}"
@@ -69,12 +69,12 @@ def parse(
     default: Any = None,
     shown: Collection[str] = (),
 ) -> Arguments:
-    """The arguments of the command of that name; --help prints the fields of `kind` and exits.
+    """Parses the arguments of a command; --help prints the fields of `kind` and exits.
 
     Args:
-      shown: the fields that --help shows; --help-all shows every one. All of them if left out.
+      shown: the fields that --help shows, all if left out; --help-all shows every field.
     Raises:
-      UsageError: an unknown flag (with the nearest one), or a value of the wrong type.
+      UsageError: a flag is unknown (the message names the nearest), or a value has the wrong type.
     """
     printed = io.StringIO()
     options = {} if default is None else {"default": default}
@@ -98,7 +98,7 @@ def parse(
 
 
 def flag_values(argv: Sequence[str], flag: str) -> list[str]:
-    """The values that follow `--flag`, before the whole line is parsed."""
+    """Returns the values that follow `--flag`, before the command line is parsed."""
     values: list[str] = []
     for i, word in enumerate(argv):
         if word == flag:
@@ -109,18 +109,18 @@ def flag_values(argv: Sequence[str], flag: str) -> list[str]:
 
 
 def flag_value(argv: Sequence[str], flag: str) -> str | None:
-    """The last value that follows `--flag`, before the whole line is parsed."""
+    """Returns the last value that follows `--flag`, before the command line is parsed."""
     values = flag_values(argv, flag)
     return values[-1] if values else None
 
 
 def import_modules(argv: Sequence[str], draws: bool = False) -> None:
-    """Imports the modules that --import names, for the environments and the like they register.
+    """Imports the modules named by --import, which register environments, bonuses or methods.
 
     Args:
-      draws: the command draws robots, which is to be settled before MuJoCo is loaded.
+      draws: whether the command draws robots; this must be known before MuJoCo is loaded.
     Raises:
-      UsageError: there is no such module, or it fails.
+      UsageError: a module does not exist, or fails.
     """
     modules = flag_values(argv, "--import")
     if modules:
@@ -133,7 +133,7 @@ def import_modules(argv: Sequence[str], draws: bool = False) -> None:
 
 
 def _hiding(kind: Any, default: Any, shown: Collection[str]) -> tuple[Any, Any]:
-    """A dataclass and its default like these, whose help shows no other fields."""
+    """Returns a copy of a dataclass and of its default whose help shows only these fields."""
     types: dict[str, Any] = {}
     values: dict[str, Any] = {"__post_init__": lambda _: None, "__annotations__": types}
     for field in dataclasses.fields(kind):
@@ -149,10 +149,10 @@ def _hiding(kind: Any, default: Any, shown: Collection[str]) -> tuple[Any, Any]:
 
 
 def entry_point(main: Callable[[Sequence[str]], None]) -> Callable[[Sequence[str]], None]:
-    """A main that ends with one sentence where it can't go on.
+    """Wraps a main function so that an expected error ends it with one sentence.
 
-    Exit code 2 for a user's mistake, 1 for what the machine or the numbers did, 128 + N for a
-    signal N; 141 (SIGPIPE) where the reader of standard output has gone.
+    The exit code is 2 for a user's mistake, 1 for a failure of the machine or a number that is not
+    finite, 128 + N for signal N, and 141 (SIGPIPE) if the reader of standard output has gone.
     """
 
     @functools.wraps(main)
@@ -191,7 +191,7 @@ def _exit_code(main: Callable[[Sequence[str]], None], argv: Sequence[str]) -> in
 
 
 def _explained(error: Exception) -> tuple[int, str]:
-    """The exit code and the sentence; what no user can cause is raised again."""
+    """Returns the exit code and the sentence; raises an unexpected error again."""
     if isinstance(error, UsageError | ConfigError | RunError):
         return 2, one_line(error)
     if isinstance(error, SaveError | NonFiniteError):
@@ -205,12 +205,12 @@ def _explained(error: Exception) -> tuple[int, str]:
         where = "" if error.filename is None else f": {error.filename}"
         return 1, f"{error.strerror or one_line(error)}{where}."
     if type(error).__name__ == "JaxRuntimeError":  # whose module need not be loaded
-        return 1, f"jax cannot go on: {one_line(error)[:500]}"
+        return 1, f"jax failed: {one_line(error)[:500]}"
     raise error
 
 
 def one_line(error: Exception) -> str:
-    """The message, also where what it quotes has line breaks."""
+    """Returns the error's message on one line."""
     return re.sub(r"\s*\n\s*", " ", str(error)).strip()
 
 
@@ -220,22 +220,20 @@ def _asked_for(error: Exception) -> str:
 
 
 def _settle_other_packages() -> None:
-    """Keeps a user's settings for other programs from ending every command.
-
-    Packages warn when they are imported, which -W error makes an exception. Matplotlib refuses to
-    be imported with an MPLBACKEND that it does not know, and talks of its own cache folder; figures
-    here need neither. Tyro does not end its help in a terminal of a few columns.
-    """
+    """Overrides settings for other programs that would make every command fail."""
+    # Tyro's help does not end in a terminal of a few columns.
     if shutil.get_terminal_size().columns < NARROWEST:
         os.environ["COLUMNS"] = str(NARROWEST)
+    # With an unknown MPLBACKEND, Matplotlib cannot be imported; it also logs its cache folder.
     os.environ["MPLBACKEND"] = "agg"
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    # Packages warn when they are imported, which -W error turns into an exception.
     if any(option.startswith("error") for option in sys.warnoptions):
         warnings.simplefilter("ignore")
 
 
 def _sentence(panel: str) -> str:
-    """What tyro says in its panel, as one line: the problem, and the nearest flag if any."""
+    """Returns tyro's panel as one line: the problem and, if any, the nearest flag."""
     lines = [line.strip("│╭╮╰╯ \n") for line in panel.splitlines()[1:]]
     blank = next((i for i, line in enumerate(lines) if set(line) <= {"─"}), len(lines))
     problem = " ".join(lines[:blank]).removeprefix("Error parsing config: ").rstrip(".")

@@ -1,7 +1,7 @@
-"""Loads a run, rolls its mixture out anew, and reports what it covers.
+"""Loads a run, rolls out its mixture again, and reports what it covers.
 
 Prints a table and writes evaluation.json and figures/ into the run's directory. With --gymnasium it
-also plays the policies in Gymnasium's own environment, and reports the sim-to-sim gap.
+also rolls out the policies in Gymnasium's own environment and reports the sim-to-sim gap.
 """
 
 import dataclasses
@@ -27,25 +27,29 @@ class Arguments:
     directory: Annotated[Path, tyro.conf.Positional]
     """The run's directory."""
     episodes: int = 5
-    """Episodes of each policy."""
+    """Episodes per policy."""
     seed: int = 1
-    """Of the rollouts; training evaluates with 0."""
+    """Seed of the rollouts; training evaluates with seed 0."""
     seed_index: int = 0
-    """Which of the seeds trained side by side."""
+    """Which seed to evaluate, from 0, if the run trained several."""
     gymnasium: bool = False
-    """Also play as many episodes in Gymnasium (ant, walker2d, humanoid), on C MuJoCo in float64."""
+    """Also roll out as many episodes in Gymnasium (ant, walker2d, humanoid; C MuJoCo, float64)."""
     fallback: bool = False
-    """Where the last checkpoint is damaged, take the one before."""
+    """If the last checkpoint is damaged, use the one before."""
     modules: cli.Modules = ()
-    """A module, by name or path, that registers environments, bonuses or methods of yours."""
+    """Module, by name or path, that registers your environments, bonuses or methods."""
 
 
 def main(argv: Sequence[str]) -> None:
-    """Parses and checks, and only then loads jax."""
+    """Parses and checks the arguments, and only then loads jax.
+
+    Raises:
+      UsageError: an argument is invalid.
+    """
     cli.import_modules(argv)
     arguments = cli.parse(Arguments, argv, "evaluate")
     if arguments.episodes < 1 or arguments.seed < 0:
-        raise errors.UsageError("--episodes must be at least 1, and --seed 0 or more.")
+        raise errors.UsageError("--episodes must be at least 1, and --seed must be 0 or more.")
     config = files.read_config(arguments.directory)
     config.check_registered()
     integrity.check_any(arguments.directory)
@@ -55,14 +59,14 @@ def main(argv: Sequence[str]) -> None:
     if arguments.gymnasium:
         from maxent_jax.analysis import gymnasium_play
 
-        gymnasium_play.make(config).close()  # what is wrong is said before anything is rolled out
+        gymnasium_play.make(config).close()  # fails here rather than after the rollouts
     report = evaluate(arguments)
     files.write_json(arguments.directory / "evaluation.json", report)
     _print(report)
 
 
 def evaluate(arguments: Arguments) -> dict[str, Any]:
-    """The report, JSON-ready; the figures are drawn on the way."""
+    """Returns the report as JSON-ready data, and draws the figures."""
     import jax.numpy as jnp
     import numpy as np
 

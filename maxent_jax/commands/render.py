@@ -1,7 +1,7 @@
-"""Films a run's archived policies, one by one and side by side, with no screen.
+"""Films a run's archived policies, one by one and together, without a screen.
 
-Writes videos/policy_<i>.mp4, its strip of stills policy_<i>.png, and mixture.mp4 and mixture.png,
-where all policies play at once, into the run's directory.
+Writes into videos/ of the run's directory: policy_<i>.mp4 and policy_<i>.png (a strip of stills)
+for each policy, and mixture.mp4 and mixture.png with all policies together.
 """
 
 import dataclasses
@@ -21,42 +21,41 @@ if TYPE_CHECKING:
     from maxent_jax.analysis import Run
     from maxent_jax.visual.frames import Episode, Film
 
-FRAMES_PER_SECOND = 20  # about; fewer where a step of the environment lasts longer
+FRAMES_PER_SECOND = 20  # about; fewer if an environment step lasts longer
 VIDEO_SECONDS = 25
 SIZES = (128, 1080)  # of a picture, pixels
 MOST_STILLS = 20
-ASPECT = 16 / 9  # of all policies at once, about
+ASPECT = 16 / 9  # of all policies together, about
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Film a run: a video and a strip of stills of each policy, and of all at once."""
+    """Film a run: a video and a strip of stills of each policy, and of all together."""
 
     directory: Annotated[Path, tyro.conf.Positional]
     """The run's directory."""
     policy: int | None = None
-    """Film this policy alone."""
+    """Film only this policy."""
     episodes: int = 5
-    """Episodes rolled out with each policy; the one of median length is shown."""
+    """Episodes rolled out per policy; the one of median length is shown."""
     speed: float | None = None
-    """Of playback: how many seconds of the simulation pass in one. Left out: 1, and more where an
-    episode that reaches its time limit would last longer than 25 s."""
+    """Playback speed; if left out, 1, or more if a full episode would exceed 25 s."""
     size: int = 480
-    """Side of a policy's video in pixels, a multiple of 4; beside others it has half of it."""
+    """Side of a policy's video in pixels, a multiple of 4; half of it in the joint video."""
     stills: int = 6
-    """In a strip, equally spaced in time."""
+    """Stills in a strip, equally spaced in time."""
     seed: int = 1
-    """Of the rollouts; training evaluates with 0."""
+    """Seed of the rollouts; training evaluates with seed 0."""
     seed_index: int = 0
-    """Which of the seeds trained side by side."""
+    """Which seed to film, from 0, if the run trained several."""
     fallback: bool = False
-    """Where the last checkpoint is damaged, take the one before."""
+    """If the last checkpoint is damaged, use the one before."""
     modules: cli.Modules = ()
-    """A module, by name or path, that registers environments, bonuses or methods of yours."""
+    """Module, by name or path, that registers your environments, bonuses or methods."""
 
 
 def main(argv: Sequence[str]) -> None:
-    """Parses and checks, and only then loads jax and MuJoCo."""
+    """Parses and checks the arguments, and only then loads jax and MuJoCo."""
     cli.import_modules(argv, draws=True)
     arguments = cli.parse(Arguments, argv, "render")
     config = files.read_config(arguments.directory)
@@ -72,7 +71,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def folder(directory: Path, num_seeds: int, seed_index: int) -> Path:
-    """Where the films of a seed lie."""
+    """Returns the folder of a seed's videos."""
     videos = directory / "videos"
     return videos if num_seeds == 1 else videos / f"seed_{seed_index}"
 
@@ -108,7 +107,7 @@ def _film(arguments: Arguments) -> None:
     from maxent_jax.visual import frames, rendering
 
     run = analysis.load_run(arguments.directory, arguments.seed_index, arguments.fallback)
-    _check(arguments, run.num_policies)  # fewer than planned where the run is not finished
+    _check(arguments, run.num_policies)  # fewer than planned if the run is not finished
     with (
         rendering.scene(run.components, arguments.size) as large,
         rendering.scene(run.components, arguments.size // 2) as small,
@@ -143,7 +142,7 @@ class _Studio:
         self.num_videos, self.longest = 0, 0.0  # seconds
 
     def film(self, name: str, shot: "Film", episodes: Sequence["Episode"]) -> None:
-        """The episodes at once, to the end of the longest."""
+        """Films the episodes together, to the end of the longest."""
         from PIL import Image
 
         from maxent_jax.visual import frames

@@ -1,7 +1,7 @@
-"""One self-contained HTML page about one or several runs, and all their seeds.
+"""Writes one self-contained HTML page about one or several runs and all their seeds.
 
-Results, curves, heat maps, the paths of each policy, settings and budgets. It opens offline, and
-holds no script.
+The page shows results, curves, heat maps, the paths of each policy, settings and budgets. It opens
+offline and contains no script.
 """
 
 import base64
@@ -37,19 +37,19 @@ class Arguments:
     directories: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """The runs' directories."""
     out: Path | None = None
-    """The page; report.html in the run's directory, or here for several runs."""
+    """File for the page; if left out, report.html in the run's directory (here for several)."""
     episodes: int = 5
-    """Episodes of each policy, rolled out anew."""
+    """Episodes rolled out per policy."""
     seed: int = 1
-    """Of the rollouts; training evaluates with 0."""
+    """Seed of the rollouts; training evaluates with seed 0."""
     fallback: bool = False
-    """Where a run's last checkpoint is damaged, take the one before."""
+    """If a run's last checkpoint is damaged, use the one before."""
     modules: cli.Modules = ()
-    """A module, by name or path, that registers environments, bonuses or methods of yours."""
+    """Module, by name or path, that registers your environments, bonuses or methods."""
 
 
 def main(argv: Sequence[str]) -> None:
-    """Parses and checks, and only then loads jax."""
+    """Parses and checks the arguments, and only then loads jax."""
     cli.import_modules(argv)
     arguments = cli.parse(Arguments, argv, "report")
     configs = [files.read_config(directory) for directory in arguments.directories]
@@ -67,27 +67,29 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _check(arguments: Arguments) -> Path:
-    """Where the page goes."""
+    """Returns the path of the page."""
     directories = arguments.directories
     if not directories:
-        raise errors.UsageError("name the directory of a run, or of several.")
+        raise errors.UsageError("no run is given: name the directory of one run, or of several.")
     if len(set(directories)) < len(directories):
-        raise errors.UsageError("a directory is named twice.")
+        raise errors.UsageError("a directory is named twice: name each run once.")
     if arguments.episodes < 1 or arguments.seed < 0:
-        raise errors.UsageError("--episodes must be at least 1, and --seed 0 or more.")
+        raise errors.UsageError("--episodes must be at least 1, and --seed must be 0 or more.")
     here = directories[0] if len(directories) == 1 else Path()
     path = arguments.out or here / "report.html"
     if path.is_dir() or not path.parent.is_dir():
-        raise errors.UsageError(f"cannot write to {path}: --out must name a file in a directory.")
+        raise errors.UsageError(
+            f"cannot write to {path}: --out must name a file in an existing directory."
+        )
     files.check_writable(path.parent)
     return path
 
 
 def make(arguments: Arguments) -> str:
-    """The page.
+    """Returns the page as HTML.
 
     Raises:
-      RunError: a run that cannot be loaded.
+      RunError: a run cannot be loaded.
     """
     import jinja2
 
@@ -162,7 +164,7 @@ def _seed_section(run: "Run", seed_index: int, arguments: Arguments) -> dict[str
 
 
 def _strip(run: "Run", seed_index: int) -> str | None:
-    """The stills that `render` has left, if it has."""
+    """The stills that `render` has made, if any."""
     folder = render.folder(run.path, run.config.num_seeds, seed_index)
     try:
         content = (folder / "mixture.png").read_bytes()
@@ -172,7 +174,7 @@ def _strip(run: "Run", seed_index: int) -> str | None:
 
 
 def _svg(figure: "Figure") -> str:
-    """The figure as the address of an image that holds it, without what the page says beside it."""
+    """The figure as an image in a data URI, without the text that the page has itself."""
     import matplotlib
 
     figure.suptitle("")

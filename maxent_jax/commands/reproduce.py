@@ -1,8 +1,8 @@
-"""Reproduces the paper's figures, put right, and runs the ablations that its readers asked for.
+"""Reproduces the paper's figures, corrected, and runs the ablations that its readers asked for.
 
-A study's directory holds study.json, a run for each of its cells and, once all are finished,
-raw.csv, summary.json and its figure. Killed and started again, it goes on with what is left;
-several processes may share a directory, and machines that share none may share the cells.
+A study's directory holds study.json, a run for each cell and, once all cells are finished, raw.csv,
+summary.json and the figure. A study that was stopped and is started again resumes the unfinished
+cells. Several processes can share a directory; machines without a shared disk can share the cells.
 """
 
 import dataclasses
@@ -22,13 +22,14 @@ from maxent_jax import errors
 from maxent_jax.checks import check_choice
 from maxent_jax.commands import cli, train
 from maxent_jax.runs import locks, runtime
+from maxent_jax.runs.claim import Claim
 from maxent_jax.runs.signals import heeded
 from maxent_jax.studies import protocol
 from maxent_jax.studies.protocol import Cell
 from maxent_jax.visual import headless
 
-# What a figure of the paper is made of: studies, by name. Fig. 3's other half, weights on Ant, is
-# the study `weights`: on a CPU it takes longer than all the rest.
+# The studies from which each figure of the paper is made. The other half of Fig. 3, weights on Ant,
+# is the study `weights`: on a CPU it takes longer than all the others.
 FIGURES: dict[str, tuple[str, ...]] = {
     "fig2": (),
     "fig3": (),
@@ -42,23 +43,23 @@ class Arguments:
     """Reproduce a figure of the paper, or run a study."""
 
     what: Annotated[str, tyro.conf.Positional]
-    """fig2, fig3, fig4, fig5, all of these (all), or the name of a study."""
+    """fig2, fig3, fig4, fig5, all (these four), or the name of a study."""
     scale: str = "cpu"
-    """toy (does it run?), cpu (two cores), or paper (the paper's settings, for accelerators)."""
+    """toy (a quick check), cpu (two cores), or paper (the paper's settings, accelerators)."""
     out: Path = Path("studies")
-    """Where every study and figure has its directory."""
+    """Folder with a directory for each study and figure."""
     seeds: int | None = None
-    """Of each method; as many as the scale says if left out."""
+    """Seeds of each method; if left out, as many as the scale says."""
     jobs: int = 1
     """Processes that share the cells and the cores of this machine."""
     shard: str = "0/1"
-    """I/N: the cells I, I + N, I + 2N, ... alone, for arrays of jobs."""
+    """I/N: train only the cells I, I + N, I + 2N, ...; for job arrays."""
     figures: bool = True
-    """Draw, once all cells are finished."""
+    """Draw the figures once all cells are finished."""
 
 
 def main(argv: Sequence[str]) -> None:
-    """Parses and checks, and only then trains."""
+    """Parses and checks the arguments, and only then trains."""
     arguments = cli.parse(Arguments, argv, "reproduce")
     index, count = _check(arguments)
     whats = tuple(FIGURES) if arguments.what == "all" else (arguments.what,)
@@ -73,7 +74,7 @@ def main(argv: Sequence[str]) -> None:
     for name, cells in studies.items():
         protocol.claim(arguments.out / name, name, arguments.scale, cells)
     for what in whats:
-        with locks.holding(arguments.out / what):  # which it can be, before hours of work
+        with locks.holding(arguments.out / what):  # fails here rather than after hours of work
             pass
     if studies and arguments.jobs > 1:
         _share(arguments)
@@ -90,7 +91,7 @@ def main(argv: Sequence[str]) -> None:
         if not protocol.finished(arguments.out / name, cell)
     ]
     if left and arguments.figures:
-        print(f"{len(left)} cells are not finished, {left[0]} the first: no figures yet.")
+        print(f"no figures yet: {len(left)} cells are not finished, the first is {left[0]}.")
     elif arguments.figures:
         from maxent_jax.studies import results  # loads jax
 
@@ -99,7 +100,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def _check(arguments: Arguments) -> tuple[int, int]:
-    """The shard."""
+    """Returns the shard, as index and count."""
     check_choice("study", arguments.what, ("all", *FIGURES, *protocol.STUDIES))
     check_choice("scale", arguments.scale, protocol.SCALES)
     if arguments.seeds is not None and arguments.seeds < 1:
@@ -114,14 +115,12 @@ def _check(arguments: Arguments) -> tuple[int, int]:
             f"{arguments.what} has no cells to share: leave out --shard and --no-figures."
         )
     if arguments.out.is_file():
-        raise errors.UsageError(f"out {arguments.out} is a file: name a folder.")
+        raise errors.UsageError(f"out is {arguments.out}, but this is a file: name a folder.")
     return int(shard[1]), int(shard[2])
 
 
 def _train(directory: Path, cells: Sequence[Cell]) -> int:
-    """What is left of the cells; those that another process trains are passed over, and so is one
-    that cannot be trained, with its sentence. How many those are.
-    """
+    """Trains the unfinished cells that no other process trains; returns how many failed."""
     failures = 0
     for cell in cells:
         started = time.perf_counter()
@@ -130,23 +129,20 @@ def _train(directory: Path, cells: Sequence[Cell]) -> int:
                 continue
             at = protocol.home(directory, cell)
             runtime.prepare(cell.config.simulates_in_jax)
-            with train.claimed(train.Arguments(cell.config, out=at, resume=True)):
+            with Claim(at, cell.config, resume=True).hold():
                 from maxent_jax.runs import driver  # loads jax
 
                 train.run_to_end(cell.config, at, started, driver.Options(fallback=True))
         except locks.BusyError:
             continue
         except (errors.RunError, errors.NonFiniteError) as error:
-            print(f"error: {error} Going on with the next.", file=sys.stderr)
+            print(f"error: {error} Continuing with the next cell.", file=sys.stderr)
             failures += 1
     return failures
 
 
 def _share(arguments: Arguments) -> None:
-    """As many processes as jobs, each on its share of the cores, until all have ended.
-
-    What this process is told by a signal, it tells them; they save themselves.
-    """
+    """Runs the jobs as processes, each on its share of the cores; passes signals on to them."""
     command = [sys.executable, "-m", "maxent_jax", "reproduce", arguments.what, "--no-figures"]
     for name in ("scale", "out", "seeds", "shard"):
         value = getattr(arguments, name)
@@ -161,9 +157,9 @@ def _share(arguments: Arguments) -> None:
     handlers = {number: signal.signal(number, tell) for number in heeded()}
     try:
         for i in range(arguments.jobs):
-            # In a group of its own, so that Ctrl-C reaches it once.
+            # In its own process group, so that Ctrl-C reaches it only once.
             processes.append(subprocess.Popen(command, process_group=0))
-            if cores:  # before its threads start, which inherit it
+            if cores:  # before it starts threads, which inherit the affinity
                 os.sched_setaffinity(processes[-1].pid, cores[i :: arguments.jobs] or cores)
         codes = [process.wait() for process in processes]
     finally:

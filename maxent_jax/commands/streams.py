@@ -1,7 +1,7 @@
-"""Standard input, output and error, made safe: closed, full, cut off, or unable to show a letter.
+"""Makes standard input, output and error safe: closed, full, cut off, or lacking a letter.
 
-Messages on standard error are a courtesy: a run goes on when nobody can read them. What a command
-prints on standard output is its result: a command that cannot print it fails.
+Messages on standard error are a courtesy: a run continues if they cannot be written. What a command
+prints on standard output is its result: the command fails if it cannot be written.
 """
 
 import codecs
@@ -11,7 +11,7 @@ import os
 import sys
 from typing import Any, TextIO
 
-CUT_OFF = 141  # 128 + SIGPIPE, as a shell reports a program whose reader has gone
+CUT_OFF = 141  # 128 + SIGPIPE, as shells report a program whose reader has gone
 _GREEK = dict(α="alpha", β="beta", γ="gamma", ε="eps", η="eta", λ="lambda", π="pi", σ="sigma")
 _SIGNS = dict(zip("─│╭╮╰╯×·→’“”²", '-|++++x*>\'""2', strict=True))
 _PLAIN = str.maketrans(_GREEK | _SIGNS)
@@ -22,7 +22,7 @@ class OutputError(OSError):
 
 
 class _Output(io.FileIO):
-    """Raises OutputError once; whatever is still in a buffer is then dropped without a word."""
+    """Raises OutputError once; then drops what is still buffered."""
 
     lost = False
 
@@ -47,11 +47,11 @@ class _Messages(io.FileIO):
 
 
 def settle() -> None:
-    """Prepares the streams of this process; streams that were replaced are left alone.
+    """Prepares the streams of this process; leaves streams alone that were replaced.
 
     A letter that the encoding lacks is spelled out or becomes "?". Closed streams become
-    /dev/null: otherwise the next file that is opened would take their number, and messages would
-    be written into it.
+    /dev/null: otherwise the next file that is opened would get their descriptor, and messages
+    would be written into it.
     """
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
@@ -63,16 +63,16 @@ def settle() -> None:
 
 
 def finish() -> None:
-    """Writes what is still in the buffer of standard output.
+    """Flushes standard output.
 
     Raises:
-      OutputError: it cannot be written.
+      OutputError: standard output cannot be written.
     """
     sys.stdout.flush()
 
 
 def exit_code(error: OutputError) -> int:
-    """That of a command which could not print; it is said, unless the reader has just gone."""
+    """Returns the exit code of a command that could not print; says why unless the reader left."""
     if error.errno == errno.EPIPE:
         return CUT_OFF
     print(f"error: cannot write to standard output: {error.strerror}.", file=sys.stderr)
@@ -91,7 +91,7 @@ def _wrapped(now: TextIO | None, original: TextIO | None, number: int, raw: type
 
 
 def _spell(error: UnicodeError) -> tuple[str | bytes, int]:
-    """An error handler of codecs: plain letters; the bytes of a file name that are no text."""
+    """Handles codec errors: plain letters, and the raw bytes of file names that are not text."""
     assert isinstance(error, UnicodeEncodeError)
     letters = error.object[error.start : error.end]
     if all("\udc80" <= letter <= "\udcff" for letter in letters):

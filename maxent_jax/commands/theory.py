@@ -1,4 +1,4 @@
-"""Holds MaxEnt-H, LA and V against their bounds and the true optimum, exactly, in tabular MDPs.
+"""Compares MaxEnt-H, LA and V with their bounds and the exact optimum, in tabular MDPs.
 
 Prints tables, and writes the results as JSON and the figures as PNG.
 """
@@ -16,40 +16,40 @@ from maxent_jax.runs import files, progress, runtime
 from maxent_jax.visual import headless
 
 FITTED = ("river swim", "Garnet", "double chain", "four rooms", "open grid")
-PLAIN = ("river swim", "Garnet", "double chain", "small rooms")  # where an iteration costs little
-ON_GRIDS = 300  # iterations of the comparison elsewhere
+PLAIN = ("river swim", "Garnet", "double chain", "small rooms")  # where an iteration is cheap
+ON_GRIDS = 300  # iterations of the comparison in the other MDPs
 PLANNING_BUDGET, TOY_BUDGET = 4096, 16
 SAMPLES, TOY_SAMPLES = (1_000, 10_000, 100_000), (500, 1_000)
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """The theory, held against exact computation in tabular MDPs."""
+    """Compare the methods with their bounds and the exact optimum, in tabular MDPs."""
 
     out: Path = Path("theory.json")
-    """Results as JSON."""
+    """File for the results, JSON."""
     figures: Path | None = None
-    """A folder for the figures; that of the results if left out."""
+    """Folder for the figures; if left out, that of the results."""
     iterations: int = 1000
-    """T of the rate's fit."""
+    """T: iterations for the fit of the rate."""
     seeds: int = 20
-    """First policies, and Garnets, for the rate's fit."""
+    """First policies, and Garnet MDPs, for the fit of the rate."""
     few_seeds: int = 5
     """First policies elsewhere."""
     seed: int = 0
-    """Of everything random."""
+    """Seed of everything random."""
     discount: float = 0.95
     """γ of the discounted MDPs."""
     tolerance: float = 1e-8
-    """Of the optimum's duality gap, nats."""
+    """Largest duality gap of the optimum, in nats."""
     mdp: Path | None = None
-    """An MDP of your own in place of the five: .npz with transitions [S, A, S] and start [S]."""
+    """Your own MDP instead of the five: .npz with transitions [S, A, S] and start [S]."""
     toy: bool = False
-    """Does it run? Tiny MDPs and few iterations, whatever the other sizes say."""
+    """Quick check: tiny MDPs and few iterations, whatever the other sizes say."""
 
 
 def main(argv: Sequence[str]) -> None:
-    """Parses and checks, and only then computes."""
+    """Parses and checks the arguments, and only then computes."""
     arguments = _check(cli.parse(Arguments, argv, "theory"))
     headless.draw_nothing()
     runtime.start(simulates_in_jax=False)
@@ -65,10 +65,10 @@ def main(argv: Sequence[str]) -> None:
 
 
 def study(arguments: Arguments) -> dict[str, Any]:
-    """Every study, JSON-ready.
+    """Runs every study; returns JSON-ready data.
 
     Raises:
-      UsageError: no MDP in the user's file, or a tolerance that an optimum can't be found to.
+      UsageError: the user's file holds no MDP, or the optimum does not reach the tolerance.
     """
     from maxent_jax.theory import tabular_problems as problems
     from maxent_jax.theory import tabular_studies as studies
@@ -112,7 +112,7 @@ def study(arguments: Arguments) -> dict[str, Any]:
 
 
 def _check(arguments: Arguments) -> Arguments:
-    """With toy sizes where asked."""
+    """Returns the arguments, with toy sizes if --toy is given."""
     if arguments.toy:
         arguments = dataclasses.replace(arguments, iterations=40, seeds=2, few_seeds=2)
     for wrong, sentence in (
@@ -127,7 +127,7 @@ def _check(arguments: Arguments) -> Arguments:
         (arguments.iterations < 20, "--iterations must be at least 20, to fit a rate."),
         (
             not 1 <= arguments.few_seeds <= arguments.seeds or arguments.seeds < 2,
-            "--seeds must be at least 2, and --few-seeds from 1 up to as many.",
+            "--seeds must be at least 2, and --few-seeds from 1 to --seeds.",
         ),
         (not 0 <= arguments.seed < 2**31, "--seed must be 0 or more, and below 2^31."),
         (arguments.out.is_dir(), f"--out {arguments.out} is a folder: name a file."),

@@ -1,6 +1,6 @@
-"""Compares every file of a run's checkpoints with what was written.
+"""Compares every file of a run's checkpoints with its checksum.
 
-Prints a line for each checkpoint, and for each damage; exit code 1 if there is one.
+Prints one line per checkpoint and one per damage; the exit code is 1 if there is any damage.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ class Arguments:
 
 
 def main(argv: Sequence[str]) -> None:
-    """Loads no array library."""
+    """Parses the arguments and verifies; loads no array library."""
     directory = cli.parse(Arguments, argv, "verify").directory
     files.read_config(directory)
     integrity.check_any(directory)
@@ -33,7 +33,7 @@ def main(argv: Sequence[str]) -> None:
 
 
 def verify(directory: Path, names: Sequence[str]) -> bool:
-    """Whether these checkpoints are intact, with a line printed on each."""
+    """Prints a line about each checkpoint; returns whether all are intact."""
     intact = True
     for name in names:
         damages = list(integrity.damages(directory, name))

@@ -1,4 +1,4 @@
-"""The names that settings are chosen by, beside those of the registry. Loads no array library."""
+"""The names that settings can take, except those in the registry. Loads no array library."""
 
 from maxent_jax.config import registry
 

@@ -1,4 +1,4 @@
-"""The values that a run's settings start from: of presets, in some environments, and of methods."""
+"""The settings of each preset, and how they change with the environment and the method."""
 
 from typing import Any
 
@@ -99,11 +99,11 @@ _LONG: dict[str, Any] = dict(
 _BUDGETS = {
     "ant": dict(num_iterations=12, updates_per_step=0.125, random_baseline=False),
     "walker2d": dict(num_iterations=3, updates_per_step=0.125, **_LONG),
-    # A random policy's steps cost as much as the agent's: here a quarter of the time.
+    # A random policy's steps cost as much as the agent's: here a quarter of the run's time.
     "humanoid": dict(num_iterations=4, updates_per_step=0.25, random_baseline=False, **_LONG),
 }
 
-# What a preset does otherwise in some environment.
+# What a preset changes in some environments.
 IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
     **{("quick", env): changes | _BUDGETS.get(env, {}) for env, changes in _ROBOTS.items()},
     **{("gpu", env): dict(physics="fast", **changes) for env, changes in _ROBOTS.items()},
@@ -123,8 +123,8 @@ IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
     },
 }
 
-# What a method does otherwise in some environment, by preset. From the best policy, V on Walker2d
-# only ever walks that policy's way (docs/learning.md).
+# What a method changes in some environments, by preset. If V on Walker2d starts from the best
+# policy, it only walks in that policy's direction (docs/results/learning.md).
 OF_METHOD_IN_ENV: dict[tuple[str, str, str], dict[str, Any]] = {
     (preset, "walker2d", "v"): dict(start="scratch") for preset in ("quick", "gpu")
 }

@@ -1,8 +1,8 @@
-"""Environments, bonuses and methods by name, and what must be known of each before jax is loaded.
+"""The registry of environments, bonuses and methods: what must be known before jax is loaded.
 
-To add one: a module, and a row of a table here. From outside the package, call
-`maxent_jax.envs.register`, `maxent_jax.intrinsic.register` or `register_method`: what they add has
-a name that begins with "user:". Loads no array library.
+To add one to the package, write a module and add a row to a table here. From outside, call
+`maxent_jax.envs.register`, `maxent_jax.intrinsic.register` or `register_method`; the new name then
+begins with "user:". Loads no array library.
 """
 
 import importlib
@@ -17,7 +17,7 @@ from maxent_jax.checks import check_choice
 from maxent_jax.errors import ConfigError, ConfigTypeError, UsageError
 
 USER = "user:"
-BY_METHOD = -1  # a refresh period: that of the method
+BY_METHOD = -1  # as a refresh period: the method's own
 CORRECTIVE = "fully_corrective"
 WEIGHTS = ("uniform", "geometric", "last", CORRECTIVE)
 REFERENCES = ("mixture", "history")
@@ -27,33 +27,33 @@ PHYSICS = ("reference", "fast")
 
 
 class EnvironmentRow(NamedTuple):
-    """An environment."""
+    """What is known of an environment."""
 
-    entry: Any = None  # an envs.Entry, or where to find one: "module:name"
+    entry: Any = None  # an envs.Entry, or where it is: "module:name"
     backends: tuple[str, ...] = ("auto",)
     physics: tuple[str, ...] = ("reference",)
-    is_robot: bool = False  # an envs.task.MujocoEnv: torques to limit, health that can fail
-    has_torso: bool = False  # a floating torso, with a heading; it can be turned, and upside down
+    is_robot: bool = False  # an envs.task.MujocoEnv, with torques and a health test
+    has_torso: bool = False  # a floating torso: it has a heading and can turn over
     in_metres: bool = True  # the first two features are a position in metres
-    time_limit: int = 1000  # of the paper, control steps
+    time_limit: int = 1000  # the paper's, in control steps
 
 
 class BonusRow(NamedTuple):
-    """An intrinsic reward with a state of its own."""
+    """A bonus: an intrinsic reward with a state."""
 
-    make: Any  # intrinsic.Setting -> intrinsic.Bonus, or where to find it: "module:name"
-    num_neighbors: int = 0  # k within a batch, which must be larger
-    baseline: bool = True  # it is a method too, under the same name: it pays one policy
+    make: Any  # intrinsic.Setting -> intrinsic.Bonus, or where it is: "module:name"
+    num_neighbors: int = 0  # k within a batch; the batch must be larger
+    baseline: bool = True  # also a method of the same name, which trains one policy
 
 
 class MethodRow(NamedTuple):
-    """A method: an entry for each choice that the methods differ in."""
+    """A method: one field for each choice in which methods differ."""
 
-    weights: str  # of the archived policies: see WEIGHTS
-    refresh_period: int  # steps of all envs between refreshes of the reward; 0: once an iteration
-    reference: str  # the states that the reward is measured against: see REFERENCES
-    start: str  # the agent that an iteration starts from: see STARTS
-    settings: Mapping[str, Any] = MappingProxyType({})  # its others, whatever the preset
+    weights: str  # of the archived policies, one of WEIGHTS
+    refresh_period: int  # vector steps between refreshes of the reward; 0: once per iteration
+    reference: str  # the states that define the reward, one of REFERENCES
+    start: str  # the agent that an iteration starts from, one of STARTS
+    settings: Mapping[str, Any] = MappingProxyType({})  # its other settings, in every preset
 
 
 def _robot(name: str, has_torso: bool) -> EnvironmentRow:
@@ -95,9 +95,9 @@ BONUSES = {
     "histogram": _bonus("histogram", baseline=False),
 }
 
-# The learner of methods as their authors published them, and of the baselines.
+# The learner's settings in methods as published by their authors, and in the baselines.
 PLAIN: dict[str, Any] = {"shaping": 0.0, "return_steps": 1}
-# Bonuses are divided by their deviation; the distance to the reference has its own scale instead.
+# A bonus is divided by its standard deviation; the distance to the reference has a scale instead.
 _AS_PUBLISHED = PLAIN | {"episodic_weight": 0.0, "reward_scale": 1.0}
 
 
@@ -128,19 +128,19 @@ _REGISTERED_BY = {
 }
 
 imported: list[str] = []
-"""The modules that were imported for what they register, as the user named them."""
+"""The modules that `import_modules` imported, as the user named them."""
 
 
 def is_users(name: object) -> bool:
-    """Whether a name is that of something a user registers."""
+    """Whether a name has the form "user:NAME"."""
     return isinstance(name, str) and name.startswith(USER) and name != USER
 
 
 def environment(name: str) -> EnvironmentRow:
-    """The row of an environment; a general one for a user's that is not registered yet.
+    """Returns the row of an environment; a general row for a "user:" name not registered yet.
 
     Raises:
-      ConfigError: an unknown name.
+      ConfigError: the name is unknown.
     """
     brax = tuple(f"brax:{env}" for env in BRAX_ENVS)
     if is_users(name):
@@ -150,38 +150,36 @@ def environment(name: str) -> EnvironmentRow:
 
 
 def method(name: str) -> MethodRow:
-    """The row of a method.
+    """Returns the row of a method.
 
     Raises:
-      ConfigError: an unknown name, or a user's method that is not registered.
+      ConfigError: the name is unknown or not registered.
     """
     return _row("method", name, METHODS)
 
 
 def bonus(name: str) -> BonusRow:
-    """The row of a bonus.
+    """Returns the row of a bonus.
 
     Raises:
-      ConfigError: an unknown name, or a user's bonus that is not registered.
+      ConfigError: the name is unknown or not registered.
     """
     return _row("bonus", name, BONUSES)
 
 
 def check_name(kind: str, name: Any) -> None:
-    """Raises ConfigTypeError unless something can be registered under the name."""
+    """Raises ConfigTypeError unless the name is a non-empty string."""
     if not isinstance(name, str) or not name:
-        raise ConfigTypeError(
-            f"the {kind}'s name is {name!r}, but must be a string that is not empty."
-        )
+        raise ConfigTypeError(f"the {kind}'s name is {name!r}, but must be a non-empty string.")
 
 
 def register_environment(name: str, row: EnvironmentRow) -> None:
-    """See envs.register, which makes the row."""
+    """Adds an environment of a user; see envs.register, which makes the row."""
     ENVIRONMENTS[f"{USER}{name}"] = row
 
 
 def register_bonus(name: str, row: BonusRow) -> None:
-    """See intrinsic.register, which makes the row. The bonus is a method too."""
+    """Adds a bonus of a user, and a method of the same name; see intrinsic.register."""
     name = f"{USER}{name}"
     BONUSES[name], METHODS[name] = row, _baseline(name)
 
@@ -189,17 +187,18 @@ def register_bonus(name: str, row: BonusRow) -> None:
 def register_method(
     name: str, weights: str, refresh_period: int, reference: str, start: str, **settings: Any
 ) -> None:
-    """Makes a method known as "user:NAME", which is then trained like any other.
+    """Registers a method as "user:NAME"; it is then trained like any other.
 
     Args:
-      weights: of the archived policies: uniform, geometric, last or fully_corrective.
-      refresh_period: steps of all environments between refreshes of the reward; 0: one refresh an
-        iteration.
-      reference: the states that the reward is measured against: mixture or history.
+      name: NAME, without "user:".
+      weights: weights of the archived policies: uniform, geometric, last or fully_corrective.
+      refresh_period: vector steps (steps of all environments) between refreshes of the reward; 0:
+        one refresh per iteration.
+      reference: the states that define the reward: mixture or history.
       start: the agent that an iteration starts from: scratch, last or best.
-      **settings: other settings of `Config` that the method has, whatever the preset.
+      **settings: other settings of `Config` that the method sets in every preset.
     Raises:
-      ConfigError: a value that no method can have.
+      ConfigError: a value is invalid.
     """
     check_name("method", name)
     check_choice("weights", weights, WEIGHTS)
@@ -207,15 +206,15 @@ def register_method(
     check_choice("start", start, STARTS)
     if not isinstance(refresh_period, int) or refresh_period < 0:
         raise ConfigTypeError(
-            f"refresh_period is {refresh_period!r}, but must be a whole number from 0 up."
+            f"refresh_period is {refresh_period!r}, but must be a whole number of at least 0."
         )
-    if weights == CORRECTIVE:  # a computation of the program, where the others are a table
+    if weights == CORRECTIVE:  # computed by the program; the others are a table
         settings, weights = {"weights": CORRECTIVE, **settings}, "uniform"
     METHODS[f"{USER}{name}"] = MethodRow(weights, refresh_period, reference, start, settings)
 
 
 def check_registered(env: str, method_name: str, bonus_name: str) -> None:
-    """Raises ConfigError where one of these is a user's and is not registered."""
+    """Raises ConfigError if one of these names begins with "user:" and is not registered."""
     if is_users(env) and env not in ENVIRONMENTS:
         raise not_registered("environment", env)
     method(method_name)
@@ -224,7 +223,7 @@ def check_registered(env: str, method_name: str, bonus_name: str) -> None:
 
 
 def resolve(where: Any) -> Any:
-    """The object at "module:name"; anything but a string stands for itself."""
+    """Returns the object at "module:name"; returns anything but a string as it is."""
     if not isinstance(where, str):
         return where
     module, name = where.split(":")
@@ -232,10 +231,10 @@ def resolve(where: Any) -> Any:
 
 
 def import_modules(modules: Sequence[str]) -> None:
-    """Imports a user's modules for what they register: by name, or by the path of a .py file.
+    """Imports a user's modules, which register things, by name or by the path of a .py file.
 
     Raises:
-      UsageError: there is no such module, or it fails.
+      UsageError: a module does not exist, or fails.
     """
     for name in modules:
         try:
@@ -245,7 +244,7 @@ def import_modules(modules: Sequence[str]) -> None:
                 _import_by_name(name)
         except Exception as error:
             raise UsageError(
-                f"import is '{name}', which cannot be imported: {type(error).__name__}: {error}."
+                f"import is '{name}', but it cannot be imported: {type(error).__name__}: {error}."
             ) from error
         if name not in imported:
             imported.append(name)
@@ -267,10 +266,10 @@ def _import_file(path: Path) -> None:
 
 
 def not_registered(kind: str, name: str) -> ConfigError:
-    """The error for a user's name that nothing was registered under."""
+    """Returns the error for a "user:" name that is not registered."""
     return ConfigError(
         f"{kind} '{name}' is not registered: call {_REGISTERED_BY[kind]} first; on a command line, "
-        f"name the module that does with --import."
+        f"pass the module that calls it with --import."
     )
 
 

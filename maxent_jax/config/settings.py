@@ -11,7 +11,7 @@ from maxent_jax.errors import ConfigError, ConfigTypeError
 
 
 class _Checked:
-    """A group whose values are of the types that its fields say."""
+    """A group of settings, each converted to the type of its field."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
@@ -21,73 +21,71 @@ class _Checked:
 
 @dataclasses.dataclass(frozen=True)
 class Budget(_Checked):
-    """How much is trained, and in what portions."""
+    """How long to train, and in what portions."""
 
     num_iterations: int = 6
-    """T: policies trained after the initial one."""
+    """T: iterations of the outer loop; each trains a policy and adds it to the mixture."""
     steps_per_iteration: int = 60_000
-    """Env steps of training in an iteration, all envs together."""
+    """Env steps of training per iteration, summed over environments."""
     updates_per_step: float = 0.5
     """Gradient steps per env step."""
     num_envs: int = 32
-    """N: environments stepped together."""
+    """N: environments stepped in parallel."""
     num_segments: int = 15
-    """Parts of an iteration; progress is shown after each."""
+    """Segments of an iteration; progress is shown after each."""
     plateau_segments: int = 0
-    """End an iteration before its budget is spent once its reward has stopped rising, judged by
-    means over so many segments; 0: never."""
+    """End an iteration early when its mean reward over so many segments stops rising; 0: never."""
     plateau_tolerance: float = 0.05
-    """What still counts as rising: a share of all that the reward rose in the iteration."""
+    """A rise up to this share of the iteration's whole rise in reward counts as a plateau."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Environment(_Checked):
-    """The episodes that states come from."""
+    """The environment: its physics, and how its episodes start and end."""
 
     backend: str = "auto"
     """Physics: mjx, mujoco (C MuJoCo), warp (MuJoCo Warp), or auto: mujoco on a CPU, else mjx."""
     physics: str = "reference"
-    """reference (the options of Gymnasium's XML) or fast (cheaper ones, see the README)."""
+    """reference (Gymnasium's XML options), or fast (cheaper, see docs/concepts/environments.md)."""
     episode_length: int = 1000
-    """Time limit, control steps."""
+    """Time limit of an episode, in control steps."""
     num_starts: int = 4096
-    """Pool of random starts."""
+    """Random start states in the pool that episodes start from."""
     torque_limit: float = 1.0
-    """Share of the control range that the agent may use; below 1 departs from the paper."""
+    """Fraction of the control range that the agent may use; below 1 departs from the paper."""
     end_flipped: bool = False
-    """End an episode upside down; departs from the paper."""
+    """End an episode when the robot is upside down; departs from the paper."""
     end_unhealthy: bool = True
-    """End an episode where the robot's health fails."""
+    """End an episode when the robot's health fails (health termination)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Intrinsic(_Checked):
-    """The intrinsic reward that SAC is paid, in place of a reward from the environment."""
+    """The intrinsic reward that SAC receives in place of a reward from the environment."""
 
     reward: str = "log1p"
-    """log1p: log(1 + R/c); linear: R/c; log: log(R/c); paper: p log R."""
+    """log1p: log(1 + R/c); linear: R/c; log: log(R/c); paper: p log R. R: k-NN distance."""
     reward_distance: float = 5.0
-    """c, in feature units (metres for the first two features)."""
+    """c: scale of the distance R, in feature units (metres for the first two features)."""
     reward_scale: float = 1.0
-    """Factor on the whole reward that SAC sees."""
+    """Factor on the whole reward that SAC receives, except --alive-bonus."""
     num_neighbors: int = 3
-    """k."""
+    """k: R is the distance to the k-th nearest reference state."""
     shaping: float = 0.0
-    """Potential-based shaping: the potential, as a multiple of the reward's form. 0: none."""
+    """Potential-based shaping: the potential is this factor times the reward; 0: none."""
     shaping_space: str = "features"
-    """Where the potential's distance is measured: features (it is R), or position (the first two
-    alone: free of the noise of the joints)."""
+    """Distance of the potential: in features (R), or in position (first two, no joint noise)."""
     shaping_survives_death: bool = False
-    """A state in which health fails keeps its potential: not policy-invariant."""
+    """Keep the potential at health termination; shaping is then not policy-invariant."""
     alive_bonus: float = 0.0
-    """Paid for each step that does not end in death, on the scale of what SAC is paid."""
+    """Reward added to each step without health termination; --reward-scale does not apply."""
     stale_rewards: bool = False
-    """Keep what a step was paid when it was taken, whatever becomes of the reference."""
+    """Keep each step's reward as it was when taken, although the reference changes."""
     episodic_weight: float = 0.0
-    """λ of the episodic term. 0: none."""
+    """λ: weight of the episodic term; 0: none."""
     bonus: str = "none"
-    """What pays SAC in place of the distance to the reference: none, or a reward of
-    maxent_jax/intrinsic: rnd, icm, ngu, re3, rise, renyi, vcse, kmeans, apt, histogram."""
+    """Bonus that replaces the distance to the reference: none, rnd, icm, ngu,
+    re3, rise, renyi, vcse, kmeans, apt, histogram, or user:NAME."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,88 +93,85 @@ class Mixture(_Checked):
     """The archive of policies, and the reference: the states that define the reward."""
 
     snapshots: int = 1
-    """Policies that an iteration archives, evenly over its segments, the last at its end."""
+    """Policies archived per iteration, evenly over its segments, the last at its end."""
     weights: str = "method"
-    """Of the mixture: uniform, geometric, last (the newest policy alone), fully_corrective (the
-    largest entropy that the archived policies can mix to, on the grid of the coverage), or as the
-    method says."""
+    """Weights of the policies: method (its own choice), uniform, geometric,
+    last (newest policy only), or fully_corrective (largest entropy of the
+    mixture on the coverage grid)."""
     eta: float = 0.1
     """η of the geometric weights."""
     mixing: str = "episode"
-    """A policy of the mixture is drawn for each episode, or for each step."""
+    """How often the mixture draws a policy: for each episode, or for each step."""
     pooled: bool = False
-    """Draw the reference from the pooled states of the mixture, so that long-lived policies weigh
-    more, instead of giving each policy its weight."""
+    """Draw policies by weight and pool their states: those with long episodes then weigh more."""
     reference: str = "method"
-    """What the reward is measured against: mixture (its rollouts), history (a uniform sample of
-    all states visited in training and, before there were any, in the first rollouts), or as the
-    method says."""
+    """States that define the reward: method (its own choice), mixture (its
+    rollouts), or history (uniform sample of all states visited in training,
+    before training in the first rollouts)."""
     reference_size: int = 8192
-    """M: states that define the reward."""
+    """M: reference states."""
     refresh_period: int = BY_METHOD
-    """Steps of all envs between refreshes of the reward; 0: once an iteration; -1: as the method
-    says. A mixture changes once an iteration, so that any period above 0 matters to history."""
+    """Vector steps between refreshes of the reward; 0: once per iteration; -1:
+    the method's choice. Above 0 it affects history only, because a mixture
+    changes once per iteration. A vector step is one step of all environments."""
     mixture_episodes: int = 32
-    """Episodes rolled out with the mixture for each refresh, and again for each evaluation."""
+    """Episodes of the mixture for each refresh, and again for each evaluation."""
     start: str = "method"
-    """The agent that an iteration starts from: scratch, last, best, or as the method says."""
+    """Agent that an iteration starts from: method (its own choice), scratch, last or best."""
     leave_own_out: bool = True
     """Score an archived policy without its own states in the reference."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Learner(_Checked):
-    """SAC: what its networks see, their size, and how they learn."""
+    """SAC: the inputs and the size of its networks, and how they learn."""
 
     policy_inputs: str = "state"
-    """What the networks see: state, or heading (the same in the agent's own horizontal frame)."""
+    """Inputs of the networks: state, or heading (the state in the robot's horizontal frame)."""
     yaw_copies: int = 0
-    """Copies of each episode, turned by a random yaw, that the learner draws like the others."""
+    """Copies of each episode, turned by a random yaw, from which SAC also learns."""
     normalize_inputs: bool = False
-    """Networks see their inputs less the running mean of training, over its deviation."""
+    """Normalise network inputs by their running mean and standard deviation."""
     hidden_layers: int = 2
-    """Hidden layers of actor and critics."""
+    """Hidden layers of the actor and of each critic."""
     hidden_size: int = 256
-    """Units in each."""
+    """Units in each hidden layer."""
     critic_layer_norm: bool = False
-    """Layer norm in the critics; departs from the paper."""
+    """Use layer norm in the critics; departs from the paper."""
     learning_rate: float = 3e-4
-    """Adam, for actor, critics and temperature."""
+    """Adam's learning rate, for actor, critics and temperature."""
     batch_size: int = 128
-    """Transitions in a gradient step."""
+    """Transitions per gradient step."""
     replay_size: int = 1_000_000
-    """Env steps kept."""
+    """Env steps that the replay buffer holds."""
     replay_dtype: str = "float32"
-    """Of the states kept: float32, or float16 at half the memory (features and distances keep 32
-    bits)."""
+    """States in the replay: float32, or float16 (half the memory; the rest keeps 32 bits)."""
     discount: float = 0.99
-    """γ."""
+    """γ: discount factor."""
     return_steps: int = 1
-    """n: rewards summed before the critics' estimate of what follows."""
+    """n: rewards summed before the critics' estimate of the rest (n-step returns)."""
     soft_update_rate: float = 0.005
-    """Of the target critics."""
+    """Soft update rate of the target critics."""
     initial_temperature: float = 0.2
-    """α at the start."""
+    """Initial temperature α."""
     target_entropy_scale: float = 1.0
-    """Target entropy is minus this many nats per action dimension."""
+    """The target entropy is minus this many nats per action dimension."""
     lagrangian_entropy: bool = False
-    """Count the policy's entropy from its target in the soft return, so that at its target a policy
-    neither gains nor loses by living."""
+    """Count entropy relative to its target, so that survival is neutral at the target entropy."""
     restart_temperature: bool = False
-    """Put α back to its initial value at the start of each iteration."""
+    """Reset α to its initial value at the start of each iteration."""
     actor_average: float = 0.0
-    """Rate at which an average follows the actor, update by update; the average is archived. 0: the
-    actor itself is."""
+    """Rate per update of the actor's moving average, which is archived; 0: archive the actor."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluation(_Checked):
-    """What is measured beside training."""
+    """What is measured in addition to training."""
 
     deterministic: bool = False
-    """The mixture's policies act by their mean where they are evaluated."""
+    """Evaluate the policies of the mixture with their mean actions."""
     random_baseline: bool = True
-    """Step a uniformly random policy beside the agent, for as many env steps, and log it."""
+    """Also step a uniformly random policy for as many env steps as the agent, and log it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,11 +183,11 @@ class Config(_Checked):
     method: str = "v"
     """h (Hazan 2019), la (Liu & Abbeel 2021), v (Veritas), h-official, or a bonus as a baseline."""
     preset: str = "quick"
-    """The values that the other flags start from: smoke, quick, gpu or paper."""
+    """Defaults of the other flags: smoke, quick, gpu or paper (docs/concepts/presets.md)."""
     seed: int = 0
-    """Of everything random but the feature projection."""
+    """Seed of everything random except the feature projection."""
     num_seeds: int = 1
-    """Seeds trained side by side by vmap: seed, seed + 1, ..."""
+    """Seeds trained together by vmap: seed, seed + 1, ..."""
 
     budget: Budget = Budget()
     environment: Environment = Environment()
@@ -207,47 +202,47 @@ class Config(_Checked):
 
     @property
     def vector_steps(self) -> int:
-        """Steps of all envs in a segment."""
+        """Vector steps (steps of all environments) per segment."""
         budget = self.budget
         return budget.steps_per_iteration // (budget.num_envs * budget.num_segments)
 
     @property
     def updates_per_vector_step(self) -> int:
-        """Gradient steps after each step of all envs."""
+        """Gradient steps after each vector step."""
         return round(self.budget.updates_per_step * self.budget.num_envs)
 
     @property
     def archive_size(self) -> int:
-        """P: the initial policy and those that each iteration archives."""
+        """P: policies in a full archive, the initial one and those of each iteration."""
         return 1 + self.budget.num_iterations * self.mixture.snapshots
 
     @property
     def simulates_in_jax(self) -> bool:
-        """Whether MJX or brax computes the physics, for all that is known before jax is loaded."""
+        """Whether MJX or brax computes the physics, as far as is known before jax is loaded."""
         return self.environment.backend == "mjx" or self.env.startswith("brax:")
 
     def flat(self) -> dict[str, Any]:
-        """Every setting by its name, without its group. No two groups share a name."""
+        """Returns every setting by name, without groups. No two groups share a name."""
         return {name: self[name] for name in DEFAULTS}
 
     def __getitem__(self, name: str) -> Any:
         return getattr(getattr(self, GROUPS[name]) if name in GROUPS else self, name)
 
     def replace(self, **changes: Any) -> "Config":
-        """This config with some settings changed, each by its name, whatever its group.
+        """Returns this config with some settings changed, by name, whatever their group.
 
         Raises:
-          ConfigTypeError: no such setting, or a value of the wrong type.
-          ConfigError: a value that no run can have.
+          ConfigTypeError: a setting does not exist, or a value has the wrong type.
+          ConfigError: a value is invalid.
         """
         return from_flat({**self.flat(), **changes})
 
     def check_registered(self) -> None:
-        """Raises ConfigError where a user's environment, method or bonus is not registered."""
+        """Raises ConfigError if a user's environment, method or bonus is not registered."""
         registry.check_registered(self.env, self.method, self.intrinsic.bonus)
 
     def program(self) -> "Config":
-        """This config with all that is data, not program, at its default.
+        """Returns this config with the settings that are data, not program, at their defaults.
 
         Configs with equal programs share one compilation; the data enters the state in
         `algorithm.init`.
@@ -258,7 +253,7 @@ class Config(_Checked):
         return self.replace(**defaults)
 
     def deviations(self) -> dict[str, str]:
-        """What this config does otherwise than the paper: by setting, in words."""
+        """Returns, by setting, a phrase on each departure of this config from the paper."""
         return paper.deviations(self.env, self.flat(), DEFAULTS)
 
 
@@ -285,11 +280,11 @@ DATA_FIELDS = (
 
 
 def from_flat(settings: Mapping[str, Any]) -> Config:
-    """The config with these settings, each by its name, and all others at their defaults.
+    """Makes a config from settings by name; all others keep their defaults.
 
     Raises:
-      ConfigTypeError: no such setting, or a value of the wrong type.
-      ConfigError: a value that no run can have.
+      ConfigTypeError: a setting does not exist, or a value has the wrong type.
+      ConfigError: a value is invalid.
     """
     _check_settings(settings)
     own: dict[str, Any] = {name: x for name, x in settings.items() if name not in GROUPS}
@@ -301,13 +296,13 @@ def from_flat(settings: Mapping[str, Any]) -> Config:
 
 
 def preset(name: str, **changes: Any) -> Config:
-    """The config of that preset, in its environment and for its method, with changes.
+    """Makes the config of a preset, for an environment and a method, with changes.
 
     Args:
       name: smoke, quick, gpu or paper.
       **changes: settings by name, whatever their group.
     Raises:
-      ConfigError: an unknown preset or setting, or a value that no run can have.
+      ConfigError: the preset or a setting is unknown, or a value is invalid.
     """
     check_choice("preset", name, presets.PRESETS)
     _check_settings(changes)

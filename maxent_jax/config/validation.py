@@ -1,4 +1,4 @@
-"""Checks of a run's settings: each by itself, and together. Loads no array library."""
+"""Checks the settings of a run, one by one and together. Loads no array library."""
 
 from collections.abc import Callable, Mapping
 from types import SimpleNamespace
@@ -26,7 +26,7 @@ _AT_LEAST_ONE = (
     *("episode_length", "num_starts", "num_neighbors", "reference_size", "mixture_episodes"),
     *("hidden_layers", "hidden_size", "batch_size", "replay_size", "return_steps"),
 )
-# Each is a loop that is written out in the program, which grows with it.
+# Each is the length of an unrolled loop: the program grows with it.
 _UNROLLED = {"hidden_layers": 64, "num_neighbors": 256, "return_steps": 256}
 MOST = 2**31 - 1  # rows and steps are counted in 32 bits
 _POSITIVE = (
@@ -48,10 +48,10 @@ _TYPES: dict[Any, tuple[Callable[[str, Any], Any], str]] = {
 
 
 def of_type(name: str, value: Any, kind: Any) -> Any:
-    """The value as that type of Python's, also where it is numpy's or jax's.
+    """Returns the value, which may be numpy's or jax's, as that Python type.
 
     Raises:
-      ConfigTypeError: it is no such value.
+      ConfigTypeError: the value has another type.
     """
     flag = _flag(name)
     if kind in _TYPES:
@@ -69,10 +69,10 @@ def of_type(name: str, value: Any, kind: Any) -> Any:
 
 
 def check(env: str, method: str, settings: Mapping[str, Any]) -> None:
-    """Refuses settings that no run can have, alone or together.
+    """Rejects settings that are invalid, alone or together.
 
     Raises:
-      ConfigError: the first of them.
+      ConfigError: a setting is invalid; the message names the first.
     """
     row = registry.environment(env)
     if not registry.is_users(method):
@@ -101,7 +101,7 @@ def check(env: str, method: str, settings: Mapping[str, Any]) -> None:
 
 
 def check_physics(env: str, backend: str, physics: str) -> None:
-    """Raises ConfigError where the environment has no such backend or physics."""
+    """Raises ConfigError if the environment does not have the backend or the physics."""
     row = registry.environment(env)
     check_choice("backend", backend, registry.BACKENDS)
     check_choice("physics", physics, registry.PHYSICS)
@@ -124,42 +124,42 @@ def _check_together(c: SimpleNamespace, row: EnvironmentRow) -> None:
     for wrong, sentence in (
         (
             c.bonus != _bonus_of(c.method, c.bonus),
-            f"method is {c.method}, but bonus is {c.bonus}: leave it to the method.",
+            f"method is {c.method}, but bonus is {c.bonus}: leave bonus out, the method sets it.",
         ),
         (
             c.bonus != "none" and (c.return_steps > 1 or c.shaping > 0 or c.episodic_weight > 0),
-            f"bonus is {c.bonus}, which is paid by the step alone: return-steps must be 1, and "
-            f"shaping and episodic-weight 0.",
+            f"bonus is {c.bonus}, which rewards single steps: return-steps must be 1, and shaping "
+            f"and episodic-weight must be 0.",
         ),
         (
             c.bonus != "none" and c.plateau_segments,
-            f"plateau-segments is {c.plateau_segments}, but is judged by the distance to the "
-            f"reference, which bonus {c.bonus} does not pay.",
+            f"plateau-segments is {c.plateau_segments}, but must be 0 with bonus {c.bonus}: a "
+            f"plateau is judged by the distance to the reference.",
         ),
         (
             c.mixing == "step" and (c.pooled or c.leave_own_out or c.weights == CORRECTIVE),
-            "mixing is step, where no state belongs to a policy: pooled, leave-own-out and fully "
+            "mixing is step, so no state belongs to one policy: pooled, leave-own-out and fully "
             "corrective weights need mixing episode.",
         ),
         (
             c.mixing == "step" and c.start == "best",
-            "mixing is step, where no state belongs to a policy: none is the best to start from.",
+            "mixing is step, so no state belongs to one policy: start best needs mixing episode.",
         ),
         (
             c.pooled and c.weights == CORRECTIVE,
-            "pooled draws policies by their weights, which fully corrective ones only get later.",
+            "pooled needs weights before the rollouts, and fully corrective weights come after.",
         ),
         (
             c.torque_limit < 1 and not row.is_robot,
-            f"torque-limit is {c.torque_limit}, but {c.env} has no torques to limit.",
+            f"torque-limit is {c.torque_limit}, but must be 1: {c.env} has no torques to limit.",
         ),
         (
             c.end_flipped and not row.has_torso,
-            f"end-flipped is on, but {c.env} has no floating torso that could be upside down.",
+            f"end-flipped is on, but {c.env} has no floating torso that can be upside down.",
         ),
         (
             not c.end_unhealthy and not row.is_robot,
-            f"end-unhealthy is off, but {c.env} has no health that could fail.",
+            f"end-unhealthy is off, but {c.env} has no health termination.",
         ),
         (
             c.policy_inputs == "heading" and not row.has_torso,
@@ -167,7 +167,7 @@ def _check_together(c: SimpleNamespace, row: EnvironmentRow) -> None:
         ),
         (
             c.yaw_copies and not row.has_torso,
-            f"yaw-copies is {c.yaw_copies}, but {c.env} cannot be turned about the vertical.",
+            f"yaw-copies is {c.yaw_copies}, but must be 0: {c.env} cannot turn about the vertical.",
         ),
         (
             2 * c.plateau_segments > c.num_segments,
@@ -181,7 +181,7 @@ def _check_together(c: SimpleNamespace, row: EnvironmentRow) -> None:
         ),
         (
             updates < 0.5 or abs(updates - round(updates)) > 1e-6,
-            f"updates-per-step × num-envs is {updates:g}, but must be a whole number from 1 up.",
+            f"updates-per-step × num-envs is {updates:g}, but must be a whole number above 0.",
         ),
         (
             c.seed + c.num_seeds > 2**31,
@@ -215,20 +215,20 @@ def _check_together(c: SimpleNamespace, row: EnvironmentRow) -> None:
         (
             updates * c.batch_size <= _neighbors_of(c.bonus),
             f"batch-size is {c.batch_size}, but bonus {c.bonus} needs more than "
-            f"{_neighbors_of(c.bonus)} transitions in the {updates:g} batches of a step.",
+            f"{_neighbors_of(c.bonus)} transitions in the {updates:g} batches of a vector step.",
         ),
         (
             4 * c.num_envs > c.replay_size,
-            f"replay-size is {c.replay_size}, but must hold four steps of all envs, "
+            f"replay-size is {c.replay_size}, but must be at least 4 × num-envs = "
             f"{4 * c.num_envs}.",
         ),
         (
             c.yaw_copies and c.replay_dtype != "float32",
-            f"replay-dtype is {c.replay_dtype}, but yaw copies need states in float32.",
+            f"replay-dtype is {c.replay_dtype}, but must be float32 with yaw-copies above 0.",
         ),
         (
             c.num_segments % c.snapshots > 0,
-            f"snapshots is {c.snapshots}, but must divide num-segments, {c.num_segments}.",
+            f"snapshots is {c.snapshots}, but must divide num-segments = {c.num_segments}.",
         ),
         (
             c.snapshots > 1 and c.plateau_segments > 0,
@@ -237,13 +237,13 @@ def _check_together(c: SimpleNamespace, row: EnvironmentRow) -> None:
         ),
         (
             c.mixture_episodes < policies,
-            f"mixture-episodes is {c.mixture_episodes}, but each of the {policies} policies "
-            f"of the mixture needs one.",
+            f"mixture-episodes is {c.mixture_episodes}, but must be at least {policies}, one for "
+            f"each policy of the mixture.",
         ),
         (
             c.reference_size > c.mixture_episodes * c.episode_length,
-            f"reference-size is {c.reference_size}, but mixture-episodes × episode-length gives at "
-            f"most {c.mixture_episodes * c.episode_length} states.",
+            f"reference-size is {c.reference_size}, but must be at most mixture-episodes × "
+            f"episode-length = {c.mixture_episodes * c.episode_length}.",
         ),
     ):
         if wrong:
@@ -251,7 +251,7 @@ def _check_together(c: SimpleNamespace, row: EnvironmentRow) -> None:
 
 
 def _bonus_of(method: str, otherwise: str) -> str:
-    """The bonus that the method sets, if it sets one."""
+    """The bonus that the method sets, if it sets any."""
     known = registry.METHODS.get(method)
     return otherwise if known is None else known.settings.get("bonus", otherwise)
 

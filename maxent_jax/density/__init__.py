@@ -1,1 +1,1 @@
-"""How densely states lie: exact nearest neighbours, entropy estimates, histograms."""
+"""Density of states: exact nearest neighbours, entropy estimates, histograms."""

@@ -1,4 +1,4 @@
-"""The k-nearest-neighbour density and entropy (Eq. 6 and 9). In nats."""
+"""Density and entropy from the k nearest neighbours (Eq. 6 and 9), in nats."""
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +10,12 @@ from maxent_jax.density.knn import knn_distances
 
 
 def log_density(distance: jax.Array, num_points: jax.Array | int, k: int, dims: int) -> jax.Array:
-    """log of k Γ(p/2 + 1) / (N π^(p/2) R^p): k points in the ball of radius R.
+    """Returns log(k Γ(p/2 + 1) / (N π^(p/2) R^p)): k of N points lie in a ball of radius R.
 
     Args:
-      distance: [...] R, to the k-th nearest of the points.
-      num_points: N, the points that could have been neighbours.
-      k: which neighbour R leads to.
+      distance: [...] R, to the k-th nearest point.
+      num_points: [] or [...] N, the points that could have been neighbours.
+      k: which neighbour R belongs to.
       dims: p.
     Returns:
       [...] nats; inf where R is 0.
@@ -28,9 +28,12 @@ def log_density(distance: jax.Array, num_points: jax.Array | int, k: int, dims: 
 def knn_density(
     queries: jax.Array, points: jax.Array, k: int, exclude: jax.Array | None = None
 ) -> jax.Array:
-    """The density at each query, [B, F] -> [B], per unit of volume. Arguments: knn_distances.
+    """Returns the density at each query, [B, F] -> [B], per unit of volume.
 
-    Source: Eq. 9. A query that names a point to exclude has one neighbour fewer to find.
+    A query that excludes a point has one neighbour fewer to find: N - 1.
+
+    Args: as `knn_distances`.
+    Source: Eq. 9.
     """
     distance = knn_distances(queries, points, k, exclude)[:, -1]
     num_points, dims = np.shape(points)
@@ -41,17 +44,17 @@ def knn_density(
 
 
 def knn_entropy(samples: jax.Array, k: int, labels: jax.Array | None = None) -> jax.Array:
-    """Differential entropy of the distribution that the samples come from.
+    """Estimates the differential entropy of the distribution that samples come from.
 
     Args:
-      samples: [N, F], measured against themselves, so that each has N - 1 others.
+      samples: [N, F]. Each is measured against the N - 1 others.
       k: which neighbour.
-      labels: [N] int, equal for samples that are one and the same, drawn more than once.
+      labels: [N] int, equal for copies of one sample that was drawn more than once.
     Returns:
       [] nats; -inf where k or more samples coincide with another one.
     Raises:
-      ValueError: N <= k, or as knn_distances.
-      TypeError: as knn_distances.
+      ValueError: N <= k, or as `knn_distances`.
+      TypeError: as `knn_distances`.
     Source: Eq. 6, with its bias correction log k - ψ(k) (Kozachenko & Leonenko 1987).
     """
     check_whole("k", k)

@@ -1,4 +1,4 @@
-"""Visits to the cells of a grid: the coverage and entropy that the paper reports."""
+"""State coverage and entropy from visits to the cells of a grid, as the paper reports them."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,33 +14,33 @@ class Grid(NamedTuple):
     low: tuple[float, float]
     high: tuple[float, float]
     bins: tuple[int, int]
-    coordinates: tuple[int, int] = (0, 1)  # of the state, or of its transform
+    coordinates: tuple[int, int] = (0, 1)  # indices in the state, or in its transform
     transform: Callable[[jax.Array], jax.Array] | None = None  # [..., D] -> [..., at least 2]
 
     @property
     def num_cells(self) -> int:
-        """Of both axes together."""
+        """The number of cells on both axes together."""
         return self.bins[0] * self.bins[1]
 
 
 def locate(states: jax.Array, grid: Grid) -> jax.Array:
-    """[..., 2]: the grid's coordinates of states [..., D]."""
+    """Returns the grid coordinates [..., 2] of states [..., D]."""
     located = grid.transform(states) if grid.transform else states
     return located[..., jnp.array(grid.coordinates)]
 
 
 def count(states: jax.Array, grid: Grid, weights: jax.Array | None = None) -> jax.Array:
-    """How often, or with how much weight, the states visit each cell.
+    """Counts how often, or with how much weight, states visit each cell.
 
     Args:
       states: [B, D].
-      grid: the cells; a state on the upper edge belongs to the last cell, as in numpy.
-      weights: [B] int or float, what each state counts; 1 when left out.
+      grid: the cells. A state on the upper edge belongs to the last cell, as in numpy.
+      weights: [B] int or float, the weight of each state; 1 when left out.
     Returns:
       [bins, bins] in the weights' dtype, else int32. States off the grid, and NaN, are dropped.
     Raises:
-      ValueError: shapes that do not match the grid or each other.
-      TypeError: no grid.
+      ValueError: the shapes do not match the grid or each other.
+      TypeError: the grid is not a Grid.
     """
     if not isinstance(grid, Grid):
         raise TypeError(f"grid is {grid!r}, but must be a density.histogram.Grid")
@@ -58,23 +58,29 @@ def count(states: jax.Array, grid: Grid, weights: jax.Array | None = None) -> ja
 
 
 def cells(states: jax.Array, grid: Grid) -> jax.Array:
-    """[B] int32: the cell of each state [B, D], row by row; num_cells off the grid, and for NaN."""
+    """Returns the cell of each state, [B, D] -> [B] int32.
+
+    Cells are numbered row by row; num_cells stands for states off the grid and for NaN.
+    """
     position = locate(states, grid)
     low, high, bins = (jnp.array([x], jnp.float32) for x in (grid.low, grid.high, grid.bins))
     cell = jnp.floor((position - low) / (high - low) * bins)
-    cell = jnp.minimum(cell, bins - 1)  # the upper edge, and what rounds up to it
+    cell = jnp.minimum(cell, bins - 1)  # the upper edge, and positions that round to it
     inside = ((position >= low) & (position <= high)).all(-1)
     row, column = jnp.where(inside[:, None], cell, 0).astype(jnp.int32).T
     return jnp.where(inside, row * grid.bins[1] + column, grid.num_cells)
 
 
 def coverage(counts: jax.Array) -> jax.Array:
-    """[] int32: cells visited at least once."""
+    """Returns the number of cells visited at least once, [...] -> [] int32."""
     return jnp.sum(jnp.asarray(counts) > 0, dtype=jnp.int32)
 
 
 def shannon_entropy(counts: jax.Array) -> jax.Array:
-    """[] nats: entropy of the cells' visit frequencies, at most log(number of cells); 0 if none."""
+    """Returns the entropy of visit frequencies, [...] -> [] nats, at most log(number of cells).
+
+    It is 0 without visits.
+    """
     counts = jnp.asarray(counts)
     total = jnp.sum(counts)
     frequency = counts / jnp.where(total > 0, total, 1)

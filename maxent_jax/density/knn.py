@@ -1,8 +1,8 @@
 """Exact distances to the k nearest points, on the device, without a distance matrix in memory.
 
-Distances are direct float32 differences: the expanded square loses the small ones, which matter
-most. One question, four answers that differ in speed alone: compiled C++ on a CPU, two forms in
-XLA, by blocks of points for CPUs and by one reduction for GPUs, and CUDA.
+Distances come from direct float32 differences: the expanded square loses small distances, and
+those matter most. Four implementations differ only in speed: compiled C++ for CPUs, blocks of
+points in XLA for CPUs, one reduction in XLA for GPUs, and CUDA.
 """
 
 import functools
@@ -17,18 +17,18 @@ from maxent_jax import native
 from maxent_jax.checks import check_whole
 
 NONE_EXCLUDED = -1
-# Points handled at once, unrolled. Measured on two cores with AVX-512 inside a scan: few queries
-# run fastest with 8 (0.9 against 0.3 Gpair/s with 16), many with 32 (1.6).
+# Points in an unrolled block. Measured on two cores with AVX-512, inside a scan: few queries are
+# fastest with 8 (0.9 Gpair/s, against 0.3 with 16), many with 32 (1.6).
 FEW_QUERIES, SMALL_BLOCK, LARGE_BLOCK = 2048, 8, 32
-# Where putting the points into a tree repays itself. Measured on two cores with Gaussian points,
-# the hardest: with 7 features 0.9 times as fast at this size and 3 times with 8,192 queries of
-# 131,072 points; with 10 features 2.2 times there, with 16 no longer (0.4). With a run's states
-# twice to seven times as fast from this size on.
+# Sizes from which a tree pays off. Speed relative to no tree, measured on two cores with Gaussian
+# points, the hardest: with 7 features 0.9 at this size, and 3 for 8,192 queries and 131,072 points;
+# at the latter size 2.2 with 10 features and 0.4 with 16. With the states of a run a tree is two
+# to seven times as fast from this size on.
 TREE_QUERIES, TREE_POINTS, TREE_FEATURES = 2048, 8192, 10
-# By one reduction. XLA parts the points of each query into about the root of their number, and
-# stores the k smallest of each part: 0.3 GB for these and 131,072 points.
+# Queries in one reduction. XLA divides M points into about √M groups, and stores the k smallest of
+# each group for each query: 0.3 GB for this many queries and 131,072 points.
 QUERIES_AT_ONCE = 65_536
-# What the registers of a GPU's thread hold; more goes by one reduction.
+# Limits of a GPU thread's registers; beyond them `in_cuda` uses one reduction.
 CUDA_NEIGHBORS, CUDA_FEATURES = 8, 15
 
 
@@ -40,25 +40,25 @@ def knn_distances(
     count: jax.Array | int | None = None,
     labels: jax.Array | None = None,
 ) -> jax.Array:
-    """Distances from each query to its k nearest points, ascending.
+    """Returns the distances from each query to its k nearest points, ascending.
 
-    Usable inside jit, scan and vmap; not differentiable. Memory grows with B + M, not with B × M.
+    Works inside jit, scan and vmap; is not differentiable. Memory grows with B + M, not with B × M.
 
     Args:
-      queries: [B, F] float32; other floats are searched more slowly.
+      queries: [B, F] float32; other floats are slower.
       points: [M, F], same units and dtype.
-      k: neighbours wanted.
-      exclude: [B] int, the label of the points that a query must not see, -1 for none. It is how
-        a query that is itself a point leaves itself out, also where others share its place.
-      count: how many points, from the first, are filled; all of them when left out. May be traced.
-      labels: [M] int but -1, what `exclude` names; a point's index when left out.
+      k: the number of neighbours.
+      exclude: [B] int, the label of the points that a query ignores, -1 for none. A query that is
+        itself a point ignores itself by its label, even where other points share its place.
+      count: [] int, how many points, from the first, are filled; all when left out. May be traced.
+      labels: [M] int except -1, the labels that `exclude` names; a point's index when left out.
     Returns:
-      [B, k] distances in the units of F; inf where there are fewer than k neighbours. Where values
-      are traced and so can't be refused: a point that is not finite is nobody's neighbour, and a
-      query that is not finite gets NaN.
+      [B, k] distances in the units of F; inf where there are fewer than k neighbours. Traced
+        values cannot raise an error: a point that is not finite is never a neighbour, and a query
+        that is not finite gets NaN.
     Raises:
-      ValueError: k < 1, k > M, sizes that do not match, or concrete input that is not finite.
-      TypeError: input that is no array of real numbers, or labels that are not whole ones.
+      ValueError: k < 1, k > M, the sizes do not match, or a concrete value is not finite.
+      TypeError: the input is not an array of real numbers, or labels are not whole numbers.
     """
     queries, points, k = _floats("queries", queries), _floats("points", points), check_whole("k", k)
     _check(queries, points, k, count)
@@ -92,11 +92,13 @@ def in_cpp(
     count: jax.Array,
     tree: bool | None = None,
 ) -> jax.Array:
-    """As knn_distances, in float32, on a CPU with the native library. Its distances are those of
-    by_blocks, to the bit where the processor fuses multiplication and addition.
+    """Searches in float32 on a CPU with the native library.
 
-    Args:
-      tree: whether the points are put into a tree first; where it pays, if left out.
+    The results are bit-identical to those of `by_blocks` where the processor fuses multiplication
+    and addition.
+
+    Args: as `knn_distances`, and
+      tree: whether to put the points into a tree first; when left out, where that is faster.
     """
     if tree is None:
         (num_queries, num_features), num_points = queries.shape, points.shape[0]
@@ -114,8 +116,11 @@ def in_cuda(
     labels: jax.Array,
     count: jax.Array,
 ) -> jax.Array:
-    """As knn_distances, in float32, on an NVIDIA GPU with native.cuda(). Not what knn_distances
-    takes there: it has not been measured on a GPU yet.
+    """Searches in float32 on an NVIDIA GPU with native.cuda().
+
+    `knn_distances` does not use it, because it has not been measured on a GPU yet.
+
+    Args: as `knn_distances`.
     """
     if k > CUDA_NEIGHBORS or queries.shape[1] > CUDA_FEATURES:
         return by_reduction(k, queries, points, exclude, labels, count)
@@ -123,11 +128,11 @@ def in_cuda(
 
 
 def _foreign(target: str, queries: jax.Array, k: int) -> Callable[..., jax.Array]:
-    """A search of maxent_jax.native, by the name that XLA knows it by."""
+    """A search of maxent_jax.native, by its name in XLA."""
     return jax.ffi.ffi_call(
         target,
         jax.ShapeDtypeStruct((queries.shape[0], k), jnp.float32),
-        vmap_method="expand_dims",  # what is not mapped over is not copied
+        vmap_method="expand_dims",  # does not copy unmapped operands
     )
 
 
@@ -139,10 +144,13 @@ def by_blocks(
     labels: jax.Array,
     count: jax.Array,
 ) -> jax.Array:
-    """As knn_distances. Queries lie in the SIMD lanes and keep their k smallest squares while
-    blocks of points pass by.
+    """Searches by a scan over blocks of points, for CPUs.
+
+    SIMD lanes hold the queries, each with its k smallest squares.
+
+    Args: as `knn_distances`.
     """
-    # What is no neighbour lies at infinity, and its label matches no query.
+    # A point that is no neighbour lies at infinity, and the label of padding matches no query.
     points = jnp.where(_neighbors(points, count)[:, None], points, jnp.inf)
     block = SMALL_BLOCK if queries.shape[0] <= FEW_QUERIES else LARGE_BLOCK
     padding = -points.shape[0] % block
@@ -157,7 +165,7 @@ def by_blocks(
             differences = [coordinates[f] - points_[j, f] for f in range(queries.shape[1])]
             squared = sum(d * d for d in differences)
             squared = jnp.where(exclude == labels_[j], jnp.inf, squared)
-            for i in range(k):  # insert: what is larger moves on to the next place
+            for i in range(k):  # insert: the larger one moves to the next place
                 smallest[i], squared = (
                     jnp.minimum(smallest[i], squared),
                     jnp.maximum(smallest[i], squared),
@@ -178,12 +186,16 @@ def by_reduction(
     labels: jax.Array,
     count: jax.Array,
 ) -> jax.Array:
-    """As knn_distances. One reduction over the points that carries the k smallest, with the
-    distances fused into it: a few large kernels, and no loop over blocks that a GPU would wait for.
+    """Searches by one reduction over the points that keeps the k smallest squares, for GPUs.
+
+    The distances are fused into the reduction: a few large kernels instead of a loop over blocks,
+    for which a GPU would wait.
+
+    Args: as `knn_distances`.
     """
     num_queries = queries.shape[0]
     if num_queries > QUERIES_AT_ONCE:
-        groups = -(-num_queries // QUERIES_AT_ONCE)  # rounded up, as is what each holds
+        groups = -(-num_queries // QUERIES_AT_ONCE)  # rounded up, as is the size of each
         padding = -num_queries % groups
         queries = jnp.pad(queries, ((0, padding), (0, 0))).reshape(groups, -1, queries.shape[1])
         exclude = jnp.pad(exclude, (0, padding)).reshape(groups, -1)
@@ -193,19 +205,18 @@ def by_reduction(
         )
         return found.reshape(-1, k)[:num_queries]
     points = jnp.where(_neighbors(points, count)[:, None], points, jnp.inf)
-    # [B, M], never stored. Reduced along M: along B, XLA stores it (seen in what it compiles to).
+    # [B, M], never stored. Reduced along M: along B, XLA stores it (seen in its compiled programs).
     differences = [queries[:, f, None] - points[None, :, f] for f in range(queries.shape[1])]
     squared = sum(d * d for d in differences)
     squared = jnp.where(exclude[:, None] == labels[None, :], jnp.inf, squared)
     nothing = jnp.asarray(jnp.inf, squared.dtype)
-    alone = squared, *[jnp.full_like(squared, jnp.inf)] * (k - 1)  # each point: k with itself first
+    alone = squared, *[jnp.full_like(squared, jnp.inf)] * (k - 1)  # k for each point, its own first
     return _distances(queries, jax.lax.reduce(alone, (nothing,) * k, _merged, (1,)))
 
 
 def _merged(a, b):
-    """The k smallest of two ascending lists of k: the j-th is the least, over the ways to take j
-    from both, of the larger of the two last taken.
-    """
+    """The k smallest of two ascending lists of k."""
+    # The j-th: the least, over all ways to take j from both, of the larger of the two last taken.
     smallest = []
     for j in range(len(a)):
         last_taken = [jnp.maximum(a[i], b[j - 1 - i]) for i in range(j)] + [jnp.minimum(a[j], b[j])]
@@ -219,15 +230,15 @@ def _neighbors(points, count):
 
 
 def _distances(queries, smallest):
-    """[B, k] from k arrays [B] of squares."""
+    """[B, k] from k arrays of squares, [B] each."""
     valid = jnp.all(jnp.isfinite(queries), axis=1, keepdims=True)
     return jnp.where(valid, jnp.sqrt(jnp.stack(smallest, axis=1)), jnp.nan)
 
 
 def smallest_k(values: jax.Array, k: int) -> jax.Array:
-    """[..., k]: the k smallest of [..., L], ascending, by k passes.
+    """Returns the k smallest of each row, ascending, [..., L] -> [..., k].
 
-    For short rows; `lax.top_k` sorts them whole on a CPU.
+    Makes k passes, for short rows: on a CPU `lax.top_k` sorts whole rows.
     """
     found = []
     positions = jax.lax.broadcasted_iota(jnp.int32, values.shape, values.ndim - 1)
@@ -239,7 +250,7 @@ def smallest_k(values: jax.Array, k: int) -> jax.Array:
 
 
 def _floats(name: str, values: Any) -> Any:
-    """The values as an array of floats: numpy's or jax's, as it was given."""
+    """The values as floats, in a numpy or jax array as given."""
     values = _array(name, values)
     if jnp.issubdtype(values.dtype, jnp.integer) or values.dtype == bool:
         return values.astype(jnp.float32)
@@ -263,8 +274,8 @@ def _array(name: str, values: Any) -> Any:
     try:
         array = np.asarray(values)
     except ValueError as error:  # rows of different lengths
-        raise TypeError(f"{name} cannot be made an array: {error}") from None
-    if array.dtype == np.float64:  # Python's floats, which jax takes for float32 as well
+        raise TypeError(f"{name} cannot be converted to an array: {error}") from None
+    if array.dtype == np.float64:  # Python floats, which are float32 in jax too
         return array.astype(np.float32)
     if not (np.issubdtype(array.dtype, np.number) or array.dtype == bool):
         raise TypeError(f"{name} holds {array.dtype}, but must be an array of numbers")
@@ -286,6 +297,6 @@ def _check(queries, points, k, count) -> None:
         raise ValueError(f"k is {k}, but must be from 1 to the number of points, {available}")
     for name, value in (("queries", queries), ("points", points)):
         if not isinstance(value, jax.core.Tracer):
-            rows = np.asarray(value)  # a jax array's slice would be traced inside jit
+            rows = np.asarray(value)  # slicing a jax array would be traced inside jit
             if not np.isfinite(rows if name == "queries" else rows[:available]).all():
                 raise ValueError(f"{name} hold a number that is not finite")

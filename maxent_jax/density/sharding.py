@@ -1,4 +1,4 @@
-"""The search for nearest neighbours on several devices: queries or points shared out."""
+"""The search for nearest neighbours on several devices: divides the queries or the points."""
 
 import functools
 from typing import Literal
@@ -22,20 +22,21 @@ def sharded_knn_distances(
     count: jax.Array | int | None = None,
     labels: jax.Array | None = None,
 ) -> jax.Array:
-    """knn_distances over one axis of a mesh of devices.
+    """Runs knn_distances over one axis of a mesh of devices.
 
-    Args:
-      mesh, axis: the devices.
-      shard: what is cut into as many parts as there are devices; each holds the other whole.
-        "queries" exchanges nothing. "points", for sets that one device can't hold, then gathers k
-        candidates a query from each device and keeps the k nearest.
-      queries, points, k, exclude, count, labels: as in knn_distances. Sizes need not be multiples
-        of the number of devices.
+    Sizes need not be multiples of the number of devices.
+
+    Args: as `knn_distances`, and
+      mesh: the devices.
+      axis: the mesh's axis to divide over.
+      shard: what to divide among the devices; each holds the other whole. "queries" needs no
+        communication. "points", for sets that one device cannot hold, gathers k candidates for
+        each query from each device and keeps the k nearest.
     Returns:
-      [B, k]: with "queries" shared out like them if B is a multiple of the number of devices, else
-      held by every device.
+      [B, k], divided like the queries if shard is "queries" and B a multiple of the number of
+        devices, else whole on every device.
     Raises:
-      ValueError: an unknown axis or shard; k > M; sizes that do not match.
+      ValueError: axis or shard is unknown, k > M, or the sizes do not match.
     """
     if axis not in mesh.shape:
         raise ValueError(f"the mesh has no axis '{axis}', only {', '.join(mesh.axis_names)}")
@@ -57,23 +58,23 @@ def sharded_knn_distances(
             return found
         return jax.device_put(found, NamedSharding(mesh, P()))[:num_queries]
     find = functools.partial(_of_all_points, k, axis)
-    # What fills up the last part stands behind the filled points, so that nobody sees it.
+    # Padding comes after the filled points, so that no query sees it.
     given = queries, _pad(points, size), exclude, _pad(labels, size), count
     return _on(mesh, find, given, (P(), P(axis), P(), P(axis), P()), P())
 
 
 def _on(mesh, find, given, specs, out_spec):
-    """Each device's part of the search. The mesh's axes may be explicit or automatic."""
+    """The search on each device. The mesh's axes may be explicit or automatic."""
     placed = [
         jax.device_put(x, NamedSharding(mesh, spec)) for x, spec in zip(given, specs, strict=True)
     ]
-    # The replicated results are not known to be so: a foreign function computed them.
+    # check_vma=False: jax cannot know that a foreign function's results are replicated.
     part = jax.shard_map(find, mesh=mesh, in_specs=specs, out_specs=out_spec, check_vma=False)
     return part(*placed)
 
 
 def _of_all_points(k, axis, queries, points, exclude, labels, count):
-    """Of this device's points, then of everyone's candidates."""
+    """The k nearest of this device's points, then of all devices' candidates."""
     num_here = points.shape[0]
     count = jnp.clip(count - jax.lax.axis_index(axis) * num_here, 0, num_here)
     found = knn_distances(queries, points, min(k, num_here), exclude, count, labels)

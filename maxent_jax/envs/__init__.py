@@ -1,7 +1,7 @@
-"""Where states come from. `make(name)` gives a brax Env; base.py runs many of them at once.
+"""Environments by name: `make(name)` returns a brax Env, and base.py steps many in parallel.
 
-A name is one of Gymnasium's tasks or the classic ones (ENVS), `brax:NAME` for any environment of
-brax's, or `user:NAME` for one that `register` was told of.
+A name is that of a Gymnasium task or a classic environment (config.registry.ENVS), `brax:NAME` for
+an environment of brax, or `user:NAME` for one that was added by `register`.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an option, is missing
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp (optional) is missing
     import mujoco.mjx  # noqa: F401
 
 from brax import envs as brax_envs
@@ -40,13 +40,13 @@ DEFAULT_GRID = Grid(
 
 
 def make(name: str, backend: str = "auto", physics: str = "reference", **deviations: Any) -> Env:
-    """The environment of that name.
+    """Makes the environment of a name.
 
     Args:
       name: one of ENVS, "brax:NAME" or "user:NAME".
-      backend: "mjx", "mujoco" (C MuJoCo), "warp", or "auto": `mujoco` on a CPU, else `mjx`. The
-        classic ones know "auto" alone; brax's "auto" is brax's own default, and "mjx".
-      physics: "reference" (the XML's options) or, for Gymnasium's tasks, "fast": see the README.
+      backend: "mjx", "mujoco" (C MuJoCo), "warp", or "auto": `mujoco` on a CPU, else `mjx`. Classic
+        environments have only "auto"; brax's have "auto" (brax's default) and "mjx".
+      physics: "reference" (the XML's options) or, for Gymnasium's tasks, "fast" (the task's).
       **deviations: from Gymnasium's task, see MujocoEnv.
     Raises:
       ConfigError (a ValueError): an unknown name, backend or physics, or one that cannot run here.
@@ -64,10 +64,10 @@ def make(name: str, backend: str = "auto", physics: str = "reference", **deviati
 
 
 def entry(name: str) -> Entry:
-    """How the environment of that name is made, its grid, torso and feature map.
+    """Returns how to make the environment of a name, and its grid, torso and feature map.
 
     Raises:
-      ConfigError: an unknown name.
+      ConfigError: the name is unknown.
     """
     row = registry.environment(name)
     if name.startswith("brax:"):
@@ -83,16 +83,17 @@ def register(
     grid: Grid = DEFAULT_GRID,
     phi: Features | None = None,
 ) -> None:
-    """Makes an environment of the user's known as `user:NAME`, to be trained like any other.
+    """Registers a user's environment as `user:NAME`, to be trained like any other.
 
     Args:
-      make: backend, physics -> a brax Env, whose observation is [D], D at least 2, and whose
-        action lies in [-1, 1]. The reward is not used; `done` ends an episode as a terminal.
-      grid: where coverage is measured; by default the first two observations, within ±10.
-      phi: the feature map, [..., D] -> [..., F], with `.names`; by default the first two
-        observations and five random projections of the others.
+      name: NAME.
+      make: backend, physics -> a brax Env with observation [D], D at least 2, and action [A] in
+        [-1, 1]. Its reward is not used; its `done` marks a terminal state.
+      grid: where coverage is measured; by default the observation's first two entries, within ±10.
+      phi: the feature map, [..., D] -> [..., F], with `.names`; by default the observation's first
+        two entries and five random projections of the others.
     Raises:
-      ConfigTypeError (a ValueError and a TypeError): an argument that is no such thing.
+      ConfigTypeError (a ValueError and a TypeError): an argument has the wrong type or form.
     """
     registry.check_name("environment", name)
     for wrong, sentence in (
@@ -119,16 +120,19 @@ def from_xml(
     reset_noise: float = 1e-2,
     healthy: Callable | None = None,
 ) -> MujocoEnv:
-    """An environment of any MJCF file: it observes qpos and qvel, and acts by its controls.
+    """Makes an environment from an MJCF file. It observes qpos and qvel; actions are its controls.
 
     Args:
-      frame_skip: the file's physics steps in a control step, at least 1.
+      xml: the file.
+      frame_skip: physics steps of the file in a control step, at least 1.
+      backend: as in MujocoEnv.
+      physics: the profile, as in MujocoEnv.
       reset_noise: half the range of the noise in every coordinate of a start.
-      healthy: observation [..., D] -> [...] bool, false ends an episode; by default only numbers
-        that are not finite do.
+      healthy: observation [..., D] -> [...] bool, false ends the episode; by default only numbers
+        that are not finite end it.
     Raises:
       ConfigError: MuJoCo cannot read the file, or the backend cannot simulate it.
-      TypeError: an argument of the wrong type.
+      TypeError: an argument has the wrong type.
     """
     path = check_path("xml", xml)
     if check_whole("frame_skip", frame_skip) < 1:
@@ -160,5 +164,5 @@ def _make_brax(name: str, backend: str, _physics: str) -> Env:
     if name in BRAX_HIDES_POSITION:
         options["exclude_current_positions_from_observation"] = False
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Brax System")  # that MJX is better kept
+        warnings.filterwarnings("ignore", "Brax System")  # it says that MJX is better maintained
         return brax_envs.get_environment(name, **options)

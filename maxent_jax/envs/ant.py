@@ -23,7 +23,7 @@ RESET_NOISE = 0.1  # Ant-v4: uniform in qpos, standard deviation in qvel
 
 
 def reset(key: jax.Array, rest: PhysicsState) -> PhysicsState:
-    """Ant-v4's start: the rest pose with noise in every coordinate."""
+    """Draws Ant-v4's start: the rest pose with noise in every coordinate."""
     key_qpos, key_qvel = jax.random.split(key)
     noise = jax.random.uniform(key_qpos, rest.qpos.shape, minval=-RESET_NOISE, maxval=RESET_NOISE)
     velocity = RESET_NOISE * jax.random.normal(key_qvel, rest.qvel.shape)
@@ -31,10 +31,12 @@ def reset(key: jax.Array, rest: PhysicsState) -> PhysicsState:
 
 
 def observe(state: PhysicsState, _: Derived) -> jax.Array:
+    """Returns qpos and qvel, [..., 29]."""
     return jnp.concatenate([state.qpos, state.qvel], axis=-1)
 
 
 def healthy(observation: jax.Array) -> jax.Array:
+    """Returns whether all is finite and the height healthy, [..., D] -> [...] bool."""
     low, high = HEALTHY_HEIGHT
     height = observation[..., 2]
     return jnp.isfinite(observation).all(-1) & (height >= low) & (height <= high)

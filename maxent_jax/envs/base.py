@@ -1,7 +1,7 @@
-"""Many episodes side by side, over any brax Env.
+"""Steps many episodes of any brax Env in parallel.
 
-Adds what a single Env leaves out: a time limit kept apart from termination, a fresh random start
-for each episode, the true last state of each, and a guard against non-finite physics.
+Adds what a single Env lacks: a time limit separate from termination, a random start for each
+episode, the true last state of each episode, and a guard against physics that is not finite.
 """
 
 from typing import NamedTuple, TypeVar
@@ -17,16 +17,16 @@ __all__ = ["Env", "Episodes", "State", "draw_starts", "finite_rows", "init", "se
 
 
 class Episodes(NamedTuple):
-    """N episodes under way, and the starts from which the next ones are drawn."""
+    """N episodes in progress, and the pool from which their starts are drawn."""
 
     env: State  # [N, ...]
-    age: jax.Array  # [N] int32, control steps since the episode's start
-    start: jax.Array  # [N] int32, the start from which each began
-    starts: State  # [R, ...] random starts, R far larger than N: one cached start biases entropy
+    age: jax.Array  # [N] int32, control steps since the start of the episode
+    start: jax.Array  # [N] int32, row of its start in the pool
+    starts: State  # [R, ...] the pool, R far larger than N: a single start biases entropy
 
 
 def init(env: Env, num_envs: int, num_starts: int, key: jax.Array) -> Episodes:
-    """N fresh episodes and a pool of `num_starts` random starts."""
+    """Begins N episodes, from a pool of `num_starts` random starts."""
     key_starts, key_draw = jax.random.split(key)
     starts = jax.vmap(env.reset)(jax.random.split(key_starts, num_starts))
     start = _draw_rows(starts, num_envs, key_draw)
@@ -39,20 +39,23 @@ def init(env: Env, num_envs: int, num_starts: int, key: jax.Array) -> Episodes:
 
 
 def draw_starts(starts: State, num: int, key: jax.Array) -> State:
-    """[num, ...] of the pool's starts, each drawn on its own."""
+    """Draws `num` starts from the pool, independently of each other, [num, ...]."""
     return _rows(starts, _draw_rows(starts, num, key))
 
 
 def step(
     env: Env, episodes: Episodes, action: jax.Array, episode_length: int, key: jax.Array
 ) -> tuple[Episodes, Transition]:
-    """One control step of every episode; those that end start anew.
+    """Takes one control step in every episode. Episodes that end begin again from a new start.
 
     Args:
+      env: the environment.
+      episodes: N episodes.
       action: [N, A], in [-1, 1].
-      episode_length: the time limit, control steps.
+      episode_length: the time limit, in control steps.
+      key: draws the new starts.
     Returns:
-      the episodes after it, and what happened, [N, ...].
+      The episodes after the step, and the transitions [N, ...].
     """
     before = episodes.env
     after = jax.vmap(env.step)(before, action)
@@ -79,7 +82,7 @@ def step(
 
 
 def select_rows(mask: jax.Array, on_true: Tree, on_false: Tree) -> Tree:
-    """Row by row, from one of two trees of equal shapes; `mask` is [N]."""
+    """Selects each row from one of two trees of equal shapes, by `mask` [N]."""
 
     def select(a, b):
         return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
@@ -88,7 +91,7 @@ def select_rows(mask: jax.Array, on_true: Tree, on_false: Tree) -> Tree:
 
 
 def finite_rows(state: State) -> jax.Array:
-    """[N] bool: every number of the row is finite."""
+    """Returns whether all numbers of each row are finite, [N] bool."""
     rows = state.done.shape[0]
     floats = [x for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)]
     return jnp.stack([jnp.isfinite(x).reshape(rows, -1).all(-1) for x in floats]).all(0)

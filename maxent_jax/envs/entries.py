@@ -1,4 +1,4 @@
-"""What an environment's module gives: how it is made, and what is known of it besides."""
+"""The entry of an environment: how to make it, its grid, torso and feature map."""
 
 import functools
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from maxent_jax.types import Features
 
 
 class Entry(NamedTuple):
-    """An environment: a row of the registry says where to find it."""
+    """An environment. A row of the registry says where its entry is."""
 
     make: Callable[..., Env]  # backend, physics, **deviations -> Env
     grid: Grid  # where coverage and histogram entropy are measured
@@ -22,12 +22,12 @@ class Entry(NamedTuple):
 
 
 def of_task(task: Task) -> Entry:
-    """A MuJoCo environment."""
+    """Returns the entry of a MuJoCo environment."""
     return Entry(functools.partial(MujocoEnv, task), task.grid, task.torso)
 
 
 def of_class(kind: Callable[[], Env], grid: Grid) -> Entry:
-    """An environment that has one backend and one physics."""
+    """Returns the entry of an environment with one backend and one physics."""
 
     def make(_backend: str, _physics: str) -> Env:
         return kind()

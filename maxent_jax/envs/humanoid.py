@@ -13,7 +13,7 @@
 | 271 .. 293 | qfrc_actuator: force along each degree of freedom          | N, N m       |
 | 294 .. 377 | cfrc_ext: torque and force on each body from contacts      | N m, N       |
 
-The world is one of the 14 bodies of the last fields; its entries are 0.
+cinert, cvel and cfrc_ext count the world as one of 14 bodies; its entries are 0.
 """
 
 import itertools
@@ -33,13 +33,20 @@ NUM_BODIES, NUM_VELOCITIES = 14, 23
 
 
 def observe(state: PhysicsState, derived: Derived) -> jax.Array:
+    """Returns qpos, qvel and the derived fields, [..., 378]."""
     return jnp.concatenate([state.qpos, state.qvel, *(derived[name] for name in DERIVED)], axis=-1)
 
 
 def rotate_derived(derived: jax.Array, angle: jax.Array) -> jax.Array:
-    """The derived fields [..., 331] with the world turned by `angle` [...] about the vertical.
+    """Returns the derived fields with the world turned about the vertical.
 
-    Actuator forces stay as they are. All other fields are tensors and vectors in the world's axes.
+    Actuator forces do not change. All other fields are tensors and vectors in the world's axes.
+
+    Args:
+      derived: [..., 331].
+      angle: [...] radians.
+    Returns:
+      [..., 331].
     """
     ends = itertools.accumulate((10 * NUM_BODIES, 6 * NUM_BODIES, NUM_VELOCITIES))
     cinert, cvel, force, contact = jnp.split(derived, list(ends), -1)
@@ -73,6 +80,7 @@ def _turn_inertia(inertia: jax.Array, angle: jax.Array) -> jax.Array:
 
 
 def healthy(observation: jax.Array) -> jax.Array:
+    """Returns whether the torso's height is healthy, [..., D] -> [...] bool."""
     low, high = HEALTHY_HEIGHT
     height = observation[..., 2]
     return (height > low) & (height < high)

@@ -15,19 +15,20 @@ from mujoco.mjx._src import collision_driver
 from maxent_jax.envs.physics import Derived, Physics, PhysicsState
 from maxent_jax.errors import ConfigError
 
-WARP_CONTACTS = 2**17  # contacts that Warp has room for, all environments together
+WARP_CONTACTS = 2**17  # contacts that Warp has room for, in all environments together
 WARP_CONSTRAINTS = 512  # rows of the constraint solver, for each environment
 
 
 def make(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...], impl: str) -> Physics:
-    """The model in MJX.
+    """Returns the physics of a model in MJX.
 
     Args:
+      model: the model.
       num_substeps: physics steps in a control step.
-      derived: fields of MjData to give beside the state.
+      derived: fields of MjData to return in addition to the state.
       impl: "jax" or "warp".
     Raises:
-      ConfigError: Warp is not installed, or the model has a feature that MJX does not.
+      ConfigError: Warp is not installed, or the model has a feature that MJX lacks.
     """
     if impl == "warp":
         if importlib.util.find_spec("warp") is None:
@@ -38,7 +39,7 @@ def make(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...], imp
         importlib.import_module("warp").config.quiet = True  # it reports each kernel it compiles
     model = copy.copy(model)
     model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # MJX never resets
-    if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:  # which MJX does not have
+    if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:  # MJX has no PGS
         model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
     device_model, blank = _put(model, impl, needs_forces="cfrc_ext" in derived)
 
@@ -47,7 +48,7 @@ def make(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...], imp
         data = blank.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=control)
         data = jax.lax.fori_loop(0, num_substeps, lambda _, d: mjx.step(device_model, d), data)
         after = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
-        if "cfrc_ext" in derived and impl == "jax":  # Warp has computed it in its step
+        if "cfrc_ext" in derived and impl == "jax":  # Warp computes it in its step
             data = mjx.rne_postconstraint(device_model, data)
         return after, _fields(data, derived)
 
@@ -59,7 +60,7 @@ def make(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...], imp
 
 
 def _put(model: mujoco.MjModel, impl: str, needs_forces: bool) -> tuple[mjx.Model, mjx.Data]:
-    """The model on the device, and data at rest."""
+    """Puts the model on the device; also returns data at rest."""
     try:
         device_model = mjx.put_model(model, impl=impl)
         if impl == "jax":
@@ -94,7 +95,7 @@ def _derive(model: mujoco.MjModel, derived: tuple[str, ...]) -> Callable[[Physic
 
 
 def _batched(function: Callable, num_axes: int) -> Callable:
-    """The function over so many leading axes."""
+    """Maps a function over `num_axes` leading axes."""
     for _ in range(num_axes):
         function = jax.vmap(function)
     return function
@@ -107,11 +108,11 @@ def _fields(data: mjx.Data, names: tuple[str, ...]) -> Derived:
 
 @contextlib.contextmanager
 def _capsule_frames() -> Iterator[None]:
-    """While MJX is traced: friction at a capsule on a plane lies along the capsule, as in C.
+    """Aligns the friction of a capsule on a plane with the capsule, as in C, while MJX is traced.
 
-    MJX 3.17 takes the world's y-axis for a capsule within 30 degrees of the plane's normal. That
-    turns the pyramid of friction: one Ant step in ten ends 1 to 20 % off in velocity, and turning
-    the world is no symmetry any more. See google-deepmind/mujoco, issue 2774.
+    MJX 3.17 uses the world's y-axis for a capsule within 30 degrees of the plane's normal. That
+    turns the friction pyramid: the velocity after one Ant step in ten is 1 to 20 % off, and turning
+    the world is no longer a symmetry. See google-deepmind/mujoco, issue 2774.
     """
     colliders = collision_driver._COLLISION_FUNC
     pair = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CAPSULE)

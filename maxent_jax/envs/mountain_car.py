@@ -1,12 +1,13 @@
-"""Mountain car: too weak an engine for its hill, in plain jax. MountainCarContinuous-v0's dynamics.
+"""Mountain car: an engine too weak for its hill. MountainCarContinuous-v0's dynamics in plain jax.
 
 | state | what              | unit         |
 |-------|-------------------|--------------|
 | 0     | position, in [-1.2, 0.6]  | -    |
 | 1     | velocity, in [-0.07, 0.07]| per step |
 
-Starts near the bottom of the valley, at rest. An episode ends at the goal, position 0.45, or at the
-time limit, 200 steps in the official MaxEnt-H experiments, which count visits to 12 × 11 cells.
+An episode starts at rest near the bottom of the valley. It ends at the goal, position 0.45, or at
+the time limit. The official MaxEnt-H experiments have a limit of 200 steps and count visits to
+12 × 11 cells.
 """
 
 import jax
@@ -36,7 +37,7 @@ class MountainCar(Env):
 
     @in_32_bits
     def reset(self, rng: jax.Array) -> State:
-        """At rest, somewhere in [-0.6, -0.4]."""
+        """Returns a start at rest, with a random position in [-0.6, -0.4]."""
         position = jax.random.uniform(rng, minval=START[0], maxval=START[1])
         zero = jnp.zeros(())
         start = jnp.stack([position, zero])
@@ -44,10 +45,10 @@ class MountainCar(Env):
 
     @in_32_bits
     def step(self, state: State, action: jax.Array) -> State:
-        """One step, single; an action of 1 is the whole engine.
+        """Takes one step of a single episode; an action [1] of 1 is the engine's full force.
 
         Raises:
-          ValueError: an action of the wrong size.
+          ValueError: the action has the wrong size.
         """
         action = check_action(self, action)
         position, velocity = state.pipeline_state
@@ -62,17 +63,17 @@ class MountainCar(Env):
 
     @property
     def observation_size(self) -> int:
-        """D."""
+        """The size of an observation, D."""
         return 2
 
     @property
     def action_size(self) -> int:
-        """A."""
+        """The size of an action, A."""
         return 1
 
     @property
     def backend(self) -> str:
-        """What simulates."""
+        """The simulator: "jax"."""
         return "jax"
 
 

@@ -1,5 +1,7 @@
-"""C MuJoCo on all cores: called by XLA through the native library or, where there is none or the
-program runs elsewhere than on a CPU, behind a callback. Both give the same numbers.
+"""C MuJoCo on all cores.
+
+On a CPU, XLA calls it through the native library. Without that library, or on another device, a
+callback calls its Python bindings. Both give the same numbers.
 """
 
 import copy
@@ -21,20 +23,21 @@ from maxent_jax import native
 from maxent_jax.envs.physics import Derived, Physics, PhysicsState
 
 CORES = os.cpu_count() or 1
-STATE = ("qpos", "qvel", "qacc_warmstart")  # a PhysicsState, as MjData names it
+STATE = ("qpos", "qvel", "qacc_warmstart")  # of a PhysicsState, by their names in MjData
 # Of C MuJoCo, in the order that maxent_add_model expects.
 FUNCTIONS = ("mj_makeData", "mj_step", "mj_forward", "mj_rnePostConstraint")
 Rows = list[np.ndarray]  # [B, ...] each
 Simulate = Callable[[PhysicsState, jax.Array], tuple[PhysicsState, Derived]]
-_added: dict[str, mujoco.MjModel] = {}  # what the native library holds on to
+_added: dict[str, mujoco.MjModel] = {}  # the native library keeps pointers to these
 
 
 def make(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Physics:
-    """The model in C.
+    """Returns the physics of a model in C MuJoCo.
 
     Args:
+      model: the model.
       num_substeps: physics steps in a control step.
-      derived: fields of MjData to give beside the state.
+      derived: fields of MjData to return in addition to the state.
     """
     model = copy.copy(model)  # the caller may change the original
     step = _simulate(model, num_substeps, derived)
@@ -49,7 +52,7 @@ def make(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> 
 
 
 def _simulate(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Simulate:
-    """A control step, or with 0 substeps a look at the state, in the best way there is."""
+    """A control step or, with 0 substeps, an evaluation of the state, by the fastest way."""
     by_python = through_python(model, num_substeps, derived)
     by_xla = through_xla(model, num_substeps, derived)
     if by_xla is None:
@@ -64,7 +67,7 @@ def _simulate(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]
 def through_xla(
     model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]
 ) -> Simulate | None:
-    """The native library's function, for a CPU; None if there is none, or not for this model."""
+    """Returns the native library's simulation, for a CPU; None if no library can step the model."""
     name = _add(model, derived)
     if name is None:
         return None
@@ -83,7 +86,7 @@ def through_xla(
 
 
 def through_python(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Simulate:
-    """Python's bindings behind a callback, from any device."""
+    """Returns the simulation by Python's bindings in a callback, for any device."""
     sizes = _sizes(model, derived)
     simulator: Callable[[Rows], Rows] = (
         _Threads(model, num_substeps, derived) if derived else _Batches(model, num_substeps)
@@ -92,7 +95,7 @@ def through_python(model: mujoco.MjModel, num_substeps: int, derived: tuple[str,
     def rows(*arrays):
         flat = [np.asarray(x).reshape(-1, x.shape[-1]) for x in arrays]
         lead = arrays[0].shape[:-1]
-        # A diverging simulation becomes inf, and is guarded against.
+        # A diverging simulation becomes inf; base.step ends its episode.
         with np.errstate(over="ignore"):
             return [x.reshape(*lead, -1).astype(np.float32) for x in simulator(flat)]
 
@@ -111,13 +114,11 @@ def _sizes(model: mujoco.MjModel, derived: tuple[str, ...]) -> dict[str, int]:
 
 
 def _add(model: mujoco.MjModel, derived: tuple[str, ...]) -> str | None:
-    """Makes a model known to the native library; None if it can't step this one.
-
-    Its name is that of its content, so that a program which another process compiled finds it.
-    """
+    """Adds a model to the native library and returns its name; None if it cannot be stepped."""
     library = native.library()
     if library is None or library.maxent_mujoco_version() != mujoco.mj_version():
         return None
+    # A hash of the content as the name: programs that another process compiled find the model too.
     content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
     name = hashlib.sha256(content.tobytes() + " ".join(derived).encode()).hexdigest()
@@ -141,9 +142,9 @@ def _add(model: mujoco.MjModel, derived: tuple[str, ...]) -> str | None:
 
 
 class _Batches:
-    """mujoco.batch: whole batches, without Python between their rows.
+    """mujoco.batch: steps whole batches, without Python between their rows.
 
-    A pure function of its arguments: what it holds is only scratch space.
+    A pure function of its arguments: it keeps only scratch space.
     """
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int):
@@ -167,10 +168,11 @@ class _Batches:
 
 
 class _Threads:
-    """One MjData for each core, its rows one by one: the derived fields are those of mj_step and,
-    as in Gymnasium, mj_rnePostConstraint, which no batched call of MuJoCo's makes.
+    """Steps row by row, with one MjData for each core.
 
-    With 0 substeps it looks at the state instead of stepping it, and external forces are 0.
+    The derived fields are those after mj_step and, as in Gymnasium, mj_rnePostConstraint, which no
+    batched call of MuJoCo makes. With 0 substeps the state is evaluated, not stepped, and external
+    forces are 0.
     """
 
     def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):

@@ -1,12 +1,13 @@
-"""Pendulum: a rod on a hinge and one weak motor, in plain jax. Gymnasium's Pendulum-v1.
+"""Pendulum: a rod on a hinge with a weak motor. Gymnasium's Pendulum-v1 in plain jax.
 
 | state | what             | unit  |
 |-------|------------------|-------|
 | 0, 1  | cos θ, sin θ; θ = 0 points up | - |
 | 2     | angular velocity, at most 8   | rad/s |
 
-Starts hanging at rest, as in the official MaxEnt-H experiments, which count visits to 8 × 8 cells
-of |θ| and angular velocity. It never ends before the time limit, there 200 steps.
+An episode starts hanging at rest and ends only at the time limit. The official MaxEnt-H experiments
+start there too, have a limit of 200 steps, and count visits to 8 × 8 cells of |θ| and angular
+velocity.
 """
 
 import jax
@@ -25,12 +26,13 @@ MAX_TORQUE = 2.0  # N m
 
 
 def observe(angle_and_speed: jax.Array) -> jax.Array:
+    """Returns the observation [3] of an angle and an angular velocity [2]."""
     angle, speed = angle_and_speed
     return jnp.stack([jnp.cos(angle), jnp.sin(angle), speed])
 
 
 def absolute_angle_and_speed(observation: jax.Array) -> jax.Array:
-    """[..., 2]: |θ| in [0, π], and the angular velocity."""
+    """Returns |θ| in [0, π] and the angular velocity, [..., 3] -> [..., 2]."""
     cos, sin, speed = jnp.moveaxis(observation, -1, 0)
     return jnp.stack([jnp.arctan2(jnp.abs(sin), cos), speed], axis=-1)
 
@@ -49,17 +51,17 @@ class Pendulum(Env):
 
     @in_32_bits
     def reset(self, rng: jax.Array) -> State:
-        """Hanging at rest, whatever the key."""
+        """Returns the start: hanging at rest, whatever the key."""
         del rng
         hanging, zero = jnp.array([jnp.pi, 0.0]), jnp.zeros(())
         return State(hanging, observe(hanging), zero, zero)
 
     @in_32_bits
     def step(self, state: State, action: jax.Array) -> State:
-        """One step of 0.05 s, single; an action of 1 is the whole torque.
+        """Takes one step of 0.05 s of a single episode; an action [1] of 1 is the full torque.
 
         Raises:
-          ValueError: an action of the wrong size.
+          ValueError: the action has the wrong size.
         """
         action = check_action(self, action)
         angle, speed = state.pipeline_state
@@ -73,17 +75,17 @@ class Pendulum(Env):
 
     @property
     def observation_size(self) -> int:
-        """D."""
+        """The size of an observation, D."""
         return 3
 
     @property
     def action_size(self) -> int:
-        """A."""
+        """The size of an action, A."""
         return 1
 
     @property
     def backend(self) -> str:
-        """What simulates."""
+        """The simulator: "jax"."""
         return "jax"
 
 

@@ -1,8 +1,8 @@
-"""What physics is: a state, the options of a model, and the type of a step.
+"""The interface of physics: its state, the options of a model, and the type of a step.
 
-`step(state, control) -> (state, derived)` is a pure function of any leading axes, which may be
+`step(state, control) -> (state, derived)` is a pure function for any leading axes; it can be
 jitted, scanned and vmapped. The backends (mjx_backend, mujoco_backend) run the same model with the
-same options; the rest of the program cannot tell them apart.
+same options, behind the same interface.
 """
 
 import importlib.util
@@ -17,7 +17,7 @@ from maxent_jax.errors import ConfigError
 
 
 class PhysicsState(NamedTuple):
-    """All that the next step depends on: with the warm start in it, every backend is a function."""
+    """All that the next step depends on. The warm start makes every backend a pure function."""
 
     qpos: jax.Array  # [..., nq] metres, unit quaternion, radians
     qvel: jax.Array  # [..., nv] metres and radians per second
@@ -25,34 +25,34 @@ class PhysicsState(NamedTuple):
 
 
 Derived = dict[str, jax.Array]
-"""Fields of MjData that a task observes beside the state, each [..., its size]."""
+"""Fields of MjData that a task observes in addition to the state, each [..., its size]."""
 
 
 class Physics(NamedTuple):
     """A model on a backend."""
 
     step: Callable[[PhysicsState, jax.Array], tuple[PhysicsState, Derived]]
-    """One control step, the control held. The derived fields are those that Gymnasium reads after
-    mj_step and mj_rnePostConstraint: they belong to the last evaluation of the dynamics."""
+    """One control step with constant control. The derived fields are those that Gymnasium reads
+    after mj_step and mj_rnePostConstraint: they belong to the last evaluation of the dynamics."""
     derive: Callable[[PhysicsState], Derived]
-    """The derived fields of a start, before any control or external force."""
+    """The derived fields of a start, before any control or external force acts."""
 
 
 class Options(NamedTuple):
-    """What is changed in an XML's physics; None and the defaults keep it."""
+    """Changes to the physics of an XML; None and the defaults change nothing."""
 
     integrator: str | None = None  # Euler, RK4 or implicitfast
-    substeps: int = 1  # physics steps in each of the XML's: its time step is divided
+    substeps: int = 1  # physics steps in each step of the XML, whose time step is divided
     solver: str | None = None  # Newton, CG or PGS
     iterations: int | None = None  # of the constraint solver, at most
     ls_iterations: int | None = None  # of its line search, at most
     eulerdamp: bool = True  # Euler integrates joint damping implicitly
-    self_collisions: bool = True  # else a body collides with the world alone
-    max_contacts: int | None = None  # MJX keeps this many, the deepest, of each kind of contact
+    self_collisions: bool = True  # else bodies collide only with the world
+    max_contacts: int | None = None  # MJX keeps this many of each kind of contact, the deepest
 
 
 REFERENCE = Options()
-MUJOCO_LOG = "MUJOCO_LOG.TXT"  # where C MuJoCo writes, unless told of another place
+MUJOCO_LOG = "MUJOCO_LOG.TXT"  # where C MuJoCo writes by default
 _INTEGRATORS = {
     "Euler": mujoco.mjtIntegrator.mjINT_EULER,
     "RK4": mujoco.mjtIntegrator.mjINT_RK4,
@@ -66,17 +66,17 @@ _SOLVERS = {
 
 
 def gymnasium_xml(name: str) -> Path:
-    """A file among the models of the installed gymnasium package."""
+    """Returns the path of a model in the installed gymnasium package."""
     spec = importlib.util.find_spec("gymnasium")
     assert spec is not None and spec.origin is not None
     return Path(spec.origin).parent / "envs" / "mujoco" / "assets" / name
 
 
 def keep_no_log() -> None:
-    """Keeps C MuJoCo from leaving its warnings in the working folder too; the console has them.
+    """Stops C MuJoCo from writing its warnings to the working folder; the console shows them.
 
-    Of a diverging simulation it writes a line for each warning. A log file that the user chose by
-    MjLogConfig stays.
+    A diverging simulation would write a line for each warning. A log file that the user chose with
+    MjLogConfig is kept.
     """
     config = mujoco.MjLogConfig.get()
     if config.logfile == MUJOCO_LOG and config.logto_file:
@@ -85,7 +85,7 @@ def keep_no_log() -> None:
 
 
 def load_model(xml: Path, options: Options = REFERENCE) -> mujoco.MjModel:
-    """The MuJoCo model of a file, with its options changed.
+    """Loads the MuJoCo model of a file, with changed options.
 
     Raises:
       ConfigError: MuJoCo cannot read the file.
@@ -96,12 +96,12 @@ def load_model(xml: Path, options: Options = REFERENCE) -> mujoco.MjModel:
     except ValueError as error:
         raise ConfigError(_unreadable(xml, error)) from None
     if options.max_contacts is not None:
-        for numeric in spec.numerics:  # MJX 3.17 finds its own only if no other stands before it
+        for numeric in spec.numerics:  # MJX 3.17 finds its own only if it is the first
             spec.delete(numeric)
         spec.add_numeric(name="max_contact_points", size=1, data=[options.max_contacts])
     try:
         model = spec.compile()
-    except ValueError as error:  # of a mesh that is missing, for example
+    except ValueError as error:  # a missing mesh, for example
         raise ConfigError(_unreadable(xml, error)) from None
     if options.integrator is not None:
         model.opt.integrator = _INTEGRATORS[options.integrator]
@@ -116,7 +116,7 @@ def load_model(xml: Path, options: Options = REFERENCE) -> mujoco.MjModel:
     if not options.self_collisions:
         model.geom_conaffinity[model.geom_bodyid > 0] = 0
     model.opt.timestep /= options.substeps
-    # A diverging simulation must show as such: MuJoCo would put it back to its rest pose unsaid.
+    # A diverging simulation must be noticed: MuJoCo would silently reset it to its rest pose.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     return model
 

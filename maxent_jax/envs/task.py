@@ -1,4 +1,4 @@
-"""A MuJoCo task is data and a few pure functions; one brax Env runs any of them."""
+"""A MuJoCo task, as data and a few pure functions, and the brax Env that runs any task."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,37 +20,37 @@ from maxent_jax.precision import in_32_bits
 
 
 class Task(NamedTuple):
-    """What tells one MuJoCo environment from another.
+    """What distinguishes one MuJoCo environment from another.
 
-    Functions of an observation take and give single or batched ones, [..., D].
+    Functions of an observation take single or batched ones, [..., D].
     """
 
     name: str
     xml: Path
-    frame_skip: int  # the XML's physics steps in a control step
+    frame_skip: int  # physics steps of the XML in a control step
     reset: Callable[[jax.Array, PhysicsState], PhysicsState]  # key, rest -> start
     observe: Callable[[PhysicsState, Derived], jax.Array]
     healthy: Callable[[jax.Array], jax.Array]  # -> [...] bool
     grid: Grid  # where coverage and histogram entropy are measured
-    derived: tuple[str, ...] = ()  # fields that it observes beside the state
+    derived: tuple[str, ...] = ()  # fields observed in addition to the state
     torso: Torso | None = None
-    fast: Options = physics.REFERENCE  # of the profile `fast`
+    fast: Options = physics.REFERENCE  # the profile `fast`
 
 
 class MujocoEnv(Env):
-    """A brax environment around a Task. Nothing is rewarded; the time limit is the caller's.
+    """A brax environment for a Task. It gives no reward and has no time limit.
 
     Args:
-      task: which environment.
+      task: the task.
       backend: "auto", "mjx", "mujoco" or "warp".
       profile: "reference" (the XML's options), "fast" (the task's), or Options.
-      torque_limit: share of the control range that an action of 1 uses. Below 1 it departs from
+      torque_limit: share of the control range that an action of 1 uses. Below 1 departs from
         Gymnasium.
-      end_flipped: also end an episode once the torso is upside down. Departs from Gymnasium.
-      end_unhealthy: end an episode where health fails, as Gymnasium does.
+      end_flipped: also end an episode when the torso is upside down. Departs from Gymnasium.
+      end_unhealthy: end an episode when health fails, as Gymnasium does.
     Raises:
-      ConfigError: an unknown backend or profile, or one that cannot run the task here; a torque
-        limit outside (0, 1].
+      ConfigError: the backend or profile is unknown or cannot run the task here, or the torque
+        limit is outside (0, 1].
     """
 
     @in_32_bits
@@ -69,7 +69,7 @@ class MujocoEnv(Env):
             raise ConfigError(f"torque_limit is {torque_limit}, but must be in (0, 1].")
         options = _options(task, profile)
         self.model = physics.load_model(task.xml, options)
-        """The simulated model, MuJoCo's own."""
+        """The MuJoCo model that is simulated."""
         _check(task, self.model, end_flipped)
         num_substeps = task.frame_skip * options.substeps
         self.dt = self.model.opt.timestep * num_substeps
@@ -87,7 +87,7 @@ class MujocoEnv(Env):
 
     @in_32_bits
     def reset(self, rng: jax.Array) -> State:
-        """A fresh random start, single; vmap it over keys for more."""
+        """Draws the random start of a single episode; vmap it over keys for more."""
         nv = self.model.nv
         rest = PhysicsState(
             jnp.asarray(self.model.qpos0, jnp.float32), jnp.zeros(nv), jnp.zeros(nv)
@@ -98,10 +98,10 @@ class MujocoEnv(Env):
 
     @in_32_bits
     def step(self, state: State, action: jax.Array) -> State:
-        """One control step, single; an action in [-1, 1] spans the control range.
+        """Takes one control step of a single episode; actions [A] in [-1, 1] span the controls.
 
         Raises:
-          ValueError: an action of the wrong size.
+          ValueError: the action has the wrong size.
         """
         action = check_action(self, action)
         control = self._control_center + self._control_span * jnp.clip(action, -1, 1)
@@ -119,25 +119,25 @@ class MujocoEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        """D."""
+        """The size of an observation, D."""
         return observation_size(self)
 
     @property
     def action_size(self) -> int:
-        """A."""
+        """The size of an action, A."""
         return self.model.nu
 
     @property
     def backend(self) -> str:
-        """What simulates: mjx, mujoco or warp."""
+        """The simulator: mjx, mujoco or warp."""
         return self._backend
 
 
 def resolve_backend(backend: str) -> str:
-    """The backend that runs: "auto" is `mujoco` on a CPU and `mjx` on anything else.
+    """Returns the backend to run: "auto" is `mujoco` on a CPU and `mjx` on other devices.
 
     Raises:
-      ConfigError: unknown backend.
+      ConfigError: the backend is unknown.
     """
     check_choice("backend", backend, BACKENDS)
     if backend == "auto":
@@ -146,12 +146,12 @@ def resolve_backend(backend: str) -> str:
 
 
 def observation_size(env: Env) -> int:
-    """D, by shapes alone: brax's own `observation_size` runs the simulator."""
+    """Returns D from shapes alone: brax's own `observation_size` runs the simulator."""
     return jax.eval_shape(env.reset, jax.random.key(0)).obs.shape[-1]
 
 
 def check_action(env: Env, action: jax.Array) -> jax.Array:
-    """The action in float32; raises ValueError where its last axis is not [A]."""
+    """Returns the action [..., A] in float32; raises ValueError if its last axis is not A."""
     action = jnp.asarray(action, jnp.float32)
     if action.shape[-1:] != (env.action_size,):
         raise ValueError(f"action has shape {action.shape}, expected [{env.action_size}]")
@@ -159,7 +159,7 @@ def check_action(env: Env, action: jax.Array) -> jax.Array:
 
 
 def uniform_reset(noise: float) -> Callable[[jax.Array, PhysicsState], PhysicsState]:
-    """Gymnasium's usual start: the rest pose with uniform noise in every coordinate."""
+    """Returns Gymnasium's usual reset: the rest pose with uniform noise in every coordinate."""
 
     def reset(key: jax.Array, rest: PhysicsState) -> PhysicsState:
         key_qpos, key_qvel = jax.random.split(key)
@@ -181,8 +181,8 @@ def _options(task: Task, profile: str | Options) -> Options:
 def _check(task: Task, model: mujoco.MjModel, end_flipped: bool) -> None:
     if model.na:
         raise ConfigError(
-            f"{task.xml.name} has actuators with a state of their own (activations), which the "
-            "physics state here does not carry"
+            f"{task.xml.name} has actuators with an internal state (activations), which is not "
+            "supported: use stateless actuators"
         )
     if end_flipped and task.torso is None:
-        raise ConfigError(f"{task.name} has no floating torso, so that nothing can be flipped")
+        raise ConfigError(f"{task.name} has no floating torso: end_flipped must be False")

@@ -1,8 +1,8 @@
-"""A robot whose torso floats free: which way is up, how it looks from its own heading, and turns.
+"""A robot with a floating torso: its up-axis, the view from its own heading, and rotations.
 
-An observation begins with qpos, whose first seven entries are the torso's position and quaternion
-(w, x, y, z), and qvel, whose first six are its velocity in the world's axes and its angular
-velocity in its own.
+An observation begins with qpos and qvel. The first seven entries of qpos are the torso's position
+and quaternion (w, x, y, z). The first six of qvel are its velocity in the world's axes and its
+angular velocity in the torso's axes.
 """
 
 import functools
@@ -12,25 +12,27 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-POSITION_UNIT = 10.0  # metres; a policy sees distances beyond it by their logarithm
+POSITION_UNIT = 10.0  # metres; a policy sees larger distances by their logarithm
 
 Turn = Callable[[jax.Array, jax.Array], jax.Array]  # ([..., D], angle [...]) -> [..., D]
 
 
 class Torso(NamedTuple):
-    """What a floating torso offers beside its observation [..., D]."""
+    """Functions of the observations [..., D] of a robot with a floating torso."""
 
-    num_seen: int  # entries of it, the first ones, that heading_inputs looks at
+    num_seen: int  # heading_inputs uses this many entries, from the first
     flipped: Callable[[jax.Array], jax.Array]  # -> [...] bool: upside down
     heading_inputs: Callable[[jax.Array], jax.Array]  # -> [..., I], see heading_inputs
     rotate: Turn  # turns the world, see rotate; also takes the first num_seen entries alone
 
 
 def make(num_positions: int, num_velocities: int, rotate_derived: Turn | None = None) -> Torso:
-    """For an observation that begins with so many positions and velocities.
+    """Returns the Torso for observations that begin with positions and velocities.
 
     Args:
-      rotate_derived: turns what is observed beyond them, [..., D - positions - velocities].
+      num_positions: how many positions.
+      num_velocities: how many velocities.
+      rotate_derived: turns the entries after them, [..., D - num_positions - num_velocities].
     """
     num_seen = num_positions + num_velocities
 
@@ -52,23 +54,23 @@ def make(num_positions: int, num_velocities: int, rotate_derived: Turn | None = 
 
 
 def up_axis(observation: jax.Array) -> jax.Array:
-    """[..., 3]: the torso's own vertical in the world's axes."""
+    """Returns the torso's vertical axis in the world's axes, [..., D] -> [..., 3]."""
     w, x, y, z = _quaternion(observation)
     return jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)
 
 
 def flipped(observation: jax.Array) -> jax.Array:
-    """The torso's up-axis points down; health, a range of heights, need not notice."""
+    """Returns whether the torso is upside down, [..., D] -> [...] bool; it may still be healthy."""
     return up_axis(observation)[..., 2] < 0
 
 
 def heading_inputs(observation: jax.Array, num_positions: int, num_velocities: int) -> jax.Array:
-    """The same state in the robot's own horizontal frame, where walking looks alike everywhere.
+    """Returns the state in the robot's own horizontal frame, where walking looks alike everywhere.
 
-    Returns [..., 5 + num_positions + num_velocities]: position, position seen from the heading,
+    [..., D] -> [..., 5 + num_positions + num_velocities]: position, position seen from the heading,
     direction outward, heading, height, up-axis, velocities and joints. A distance ρ from the
-    origin enters as log(1 + ρ / POSITION_UNIT): a policy meets a state farther out than it has been
-    as nearly one that it knows. What is observed beyond positions and velocities is left out.
+    origin enters as log(1 + ρ / POSITION_UNIT), so that a state farther out than any before looks
+    almost familiar to a policy. Entries after positions and velocities are left out.
     """
     w, x, y, z = _quaternion(observation)
     yaw = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -95,11 +97,18 @@ def heading_inputs(observation: jax.Array, num_positions: int, num_velocities: i
 
 
 def rotate(observation: jax.Array, angle: jax.Array, num_positions: int) -> jax.Array:
-    """The state with the world turned by `angle` [...] radians about the vertical at the origin.
+    """Returns the state with the world turned about the vertical at the origin.
 
-    A symmetry of the dynamics: the same actions lead from turned states to turned states. Where
-    the torso itself touches the ground it is one for quarter turns only, since MuJoCo's pyramid
-    of friction at a sphere lies along the world's axes.
+    This is a symmetry of the dynamics: the same actions lead from turned states to turned states.
+    Where the torso itself touches the ground, only quarter turns are, since MuJoCo's friction
+    pyramid at a sphere lies along the world's axes.
+
+    Args:
+      observation: [..., num_positions + num_velocities].
+      angle: [...] radians.
+      num_positions: how many entries are positions.
+    Returns:
+      The turned observation, of the same shape.
     """
     half_cos, half_sin = jnp.cos(angle / 2), jnp.sin(angle / 2)
     w, x, y, z = _quaternion(observation)
@@ -125,14 +134,21 @@ def rotate(observation: jax.Array, angle: jax.Array, num_positions: int) -> jax.
 
 
 def _quaternion(observation: jax.Array) -> tuple[jax.Array, ...]:
-    """w, x, y, z of unit length; MuJoCo keeps the reset noise in it until the first step."""
+    """w, x, y, z of unit length: MuJoCo keeps the reset noise in it until the first step."""
     quaternion = observation[..., 3:7]
     quaternion = quaternion / jnp.linalg.norm(quaternion, axis=-1, keepdims=True)
     return tuple(jnp.moveaxis(quaternion, -1, 0))
 
 
 def turn_vector(vector: jax.Array, angle: jax.Array) -> jax.Array:
-    """[..., 2 or more]: the first two turned by an angle [...] in radians, the others as before."""
+    """Turns the first two entries of vectors, and keeps the others.
+
+    Args:
+      vector: [..., 2 or more].
+      angle: [...] radians.
+    Returns:
+      The turned vector, of the same shape.
+    """
     x, y = vector[..., 0], vector[..., 1]
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     horizontal = jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)

@@ -25,14 +25,16 @@ RESET_NOISE = 5e-3  # Walker2d-v4
 
 
 def observe(state: PhysicsState, _: Derived) -> jax.Array:
+    """Returns qpos and the clipped qvel, [..., 18]."""
     velocity = jnp.clip(state.qvel, -LARGEST_VELOCITY, LARGEST_VELOCITY)
     return jnp.concatenate([state.qpos, velocity], axis=-1)
 
 
 def healthy(observation: jax.Array) -> jax.Array:
+    """Returns whether height and pitch are healthy, [..., D] -> [...] bool."""
     height, pitch = observation[..., 1], observation[..., 2]
     (low, high), (back, front) = HEALTHY_HEIGHT, HEALTHY_PITCH
-    # >= where Gymnasium has > : float32 rounds 0.8 up, so this is `> 0.8` of the exact number.
+    # >= instead of Gymnasium's >: float32 rounds 0.8 up, so this is `> 0.8` of the exact number.
     return (height >= low) & (height < high) & (pitch > back) & (pitch < front)
 
 

@@ -1,4 +1,4 @@
-"""Intrinsic rewards that maximum-state-entropy methods are compared with, one a file."""
+"""Bonuses: intrinsic rewards of the methods that this package compares with, one in each file."""
 
 from collections.abc import Callable
 
@@ -13,13 +13,14 @@ __all__ = ["Bonus", "Episodic", "Setting", "Steps", "make", "register"]
 
 
 def register(name: str, make: Callable[[Setting], Bonus], num_neighbors: int = 0) -> None:
-    """Makes a bonus of the user's known as `user:NAME`, and a method of that name which it pays.
+    """Registers a user's bonus as `user:NAME`, and a method of that name that uses it as reward.
 
     Args:
-      make: the functions of the bonus, for what it is made from.
-      num_neighbors: k, where it compares the states of a batch, which must then hold more.
+      name: NAME.
+      make: Setting -> Bonus.
+      num_neighbors: k of a bonus that compares the states of a batch; a batch must be larger.
     Raises:
-      ConfigTypeError (a ValueError and a TypeError): an argument that is no such thing.
+      ConfigTypeError (a ValueError and a TypeError): an argument has the wrong type or form.
     """
     registry.check_name("bonus", name)
     if not callable(make):
@@ -35,17 +36,17 @@ def make(
     learning_rate: float,
     num_cells: int,
 ) -> Bonus:
-    """The bonus of that name.
+    """Makes the bonus of a name.
 
     Args:
       name: a row of config.registry.BONUSES.
-      observation_size, action_size: D and A.
-      scale: [D] positive, what counts as 1 of each observation: networks and distances see
-        observation / scale.
-      learning_rate: of Adam, where a method learns by gradients.
+      observation_size: D.
+      action_size: A.
+      scale: [D] positive, the unit of each entry: networks and distances see observation / scale.
+      learning_rate: of Adam, if the bonus learns by gradients.
       num_cells: of the grid on which coverage is counted.
     Raises:
-      ValueError: an unknown name, or a scale that is not [D].
+      ValueError: the name is unknown, or the scale is not [D].
     """
     row = registry.bonus(name)
     if scale.shape != (observation_size,):

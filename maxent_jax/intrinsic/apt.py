@@ -1,10 +1,10 @@
-"""APT: how far a state lies from its nearest in the batch, in the embedding of ICM.
+"""APT: the distance from a state to its nearest in the batch, in the embedding of ICM.
 
 Liu & Abbeel 2021, "Behavior from the void: unsupervised active pre-training", arXiv 2103.04551
-(MaxEnt-LA of our paper), as in URLB, which has an author in common (`agent/icm_apt.py`, and `PBE`
-in `utils.py`): log(1 + mean over the k nearest of max(R_i / m - 0.0001, 0)), with m the running
-mean of all the R_i. The paper embeds images by contrastive learning; URLB, for states too, by ICM,
-whose 512 features are 50 here, see protocol. URLB pays for the state left.
+(MaxEnt-LA of our paper), as in URLB, which shares an author (`agent/icm_apt.py`, and `PBE` in
+`utils.py`): log(1 + mean over the k nearest of max(R_i / m - 0.0001, 0)), with m the running mean
+of all R_i. The paper embeds images by contrastive learning. URLB uses ICM, for states too; its 512
+features are 50 here, see protocol. URLB rewards the state that a step left.
 """
 
 import functools
@@ -24,18 +24,18 @@ from maxent_jax.types import Metrics
 
 NUM_NEIGHBORS = BONUSES["apt"].num_neighbors  # knn_k of URLB
 DISTANCE_CLIP = 1e-4  # knn_clip of URLB, in running means
-MEAN_FLOOR = 1e-8  # where all states met so far are one
+MEAN_FLOOR = 1e-8  # if all states so far are equal
 
 
 class State(NamedTuple):
-    """The embedding and its models, and the running mean of the distances."""
+    """ICM's networks, and the running mean of the distances."""
 
     icm: Learned
     distances: Moments  # []
 
 
 def make(setting: Setting) -> Bonus:
-    """The reward log(1 + mean distance to the 12 nearest), positive."""
+    """Makes the bonus log(1 + mean distance to the 12 nearest), positive."""
     fixed = icm.build(setting)
     return Bonus(
         init=functools.partial(init, fixed),
@@ -45,12 +45,12 @@ def make(setting: Setting) -> Bonus:
 
 
 def init(fixed: Icm, key: jax.Array) -> State:
-    """A fresh embedding, and a mean of nothing."""
+    """Returns random networks and an empty running mean."""
     return State(icm.init(fixed, key), moments.init())
 
 
 def reward(fixed: Icm, state: State, steps: Steps) -> tuple[State, jax.Array]:
-    """The running mean advances before it is used.
+    """Returns the reward [B]; the running mean is updated before it is used.
 
     Raises:
       ValueError: B <= 12.
@@ -63,6 +63,6 @@ def reward(fixed: Icm, state: State, steps: Steps) -> tuple[State, jax.Array]:
 
 
 def learn(fixed: Icm, state: State, steps: Steps, key: jax.Array) -> tuple[State, Metrics]:
-    """One gradient step of ICM; the running mean stays."""
+    """Takes one gradient step of ICM; the running mean does not change."""
     learned, metrics = icm.learn(fixed, state.icm, steps, key)
     return state._replace(icm=learned), metrics

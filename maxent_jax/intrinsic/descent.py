@@ -1,4 +1,4 @@
-"""Parameters that follow the gradient of a loss."""
+"""Gradient descent on a loss."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,14 +10,14 @@ from maxent_jax.types import Metrics
 
 
 class Learned(NamedTuple):
-    """Parameters, and their optimiser's state."""
+    """Parameters, and the state of their optimiser."""
 
     parameters: Any
     optimizer: Any
 
 
 def begin(optimizer: optax.GradientTransformation, parameters: Any) -> Learned:
-    """Parameters with a fresh optimiser."""
+    """Returns the parameters with a fresh optimiser."""
     return Learned(parameters, optimizer.init(parameters))
 
 
@@ -26,7 +26,7 @@ def descend(
     learned: Learned,
     loss: Callable[[Any], tuple[jax.Array, Metrics]],
 ) -> tuple[Learned, Metrics]:
-    """After one step down the gradient of `loss`; and the metrics beside the loss."""
+    """Takes one step down the gradient of `loss`, which returns a loss [] and metrics."""
     gradient, metrics = jax.grad(loss, has_aux=True)(learned.parameters)
     step, optimizer_state = optimizer.update(gradient, learned.optimizer, learned.parameters)
     return Learned(optax.apply_updates(learned.parameters, step), optimizer_state), metrics

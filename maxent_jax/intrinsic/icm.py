@@ -1,12 +1,13 @@
-"""ICM: how badly a model predicts the next state, in an embedding that tells actions apart.
+"""ICM: the error of a model of the next state, in an embedding that distinguishes actions.
 
 Pathak et al. 2017, "Curiosity-driven exploration by self-supervised prediction", arXiv 1705.05363.
-An inverse model finds the action from the embeddings before and after, a forward model the
-embedding after from the one before and the action; gradients of both reach the embedding. Networks,
-losses and reward are those of URLB for states (`agent/icm.py`, with the trunk of `icm_apt.py`,
-without which it has no embedding): the mean lengths of both errors, and log(1 + length of the
-forward error). The paper and its code (github.com/pathak22/noreward-rl) minimise 0.8 times the
-inverse loss and 0.2 times half the squared forward error, and pay 0.01 times the latter.
+An inverse model predicts the action from the embeddings before and after it. A forward model
+predicts the embedding after it from the action and the embedding before. The embedding gets the
+gradients of both. Networks, losses and reward are those of URLB for states (`agent/icm.py`, with
+the trunk of `icm_apt.py`, without which it has no embedding): the losses are the mean lengths of
+both errors, the reward is log(1 + length of the forward error). The paper and its code
+(github.com/pathak22/noreward-rl) minimise 0.8 times the inverse loss and 0.2 times half the squared
+forward error; their reward is 0.01 times the latter.
 """
 
 import functools
@@ -26,7 +27,7 @@ SQUARE_FLOOR = 1e-12  # of a squared length: the root has no slope at 0
 
 
 class Icm(NamedTuple):
-    """The fixed part."""
+    """The static part."""
 
     setting: Setting
     trunk: Trunk
@@ -36,7 +37,7 @@ class Icm(NamedTuple):
 
 
 class Parameters(NamedTuple):
-    """Of the three networks; with their optimiser, all that the state is."""
+    """Of the three networks; the state is these and their optimiser."""
 
     trunk: Any
     forward: Any
@@ -44,7 +45,7 @@ class Parameters(NamedTuple):
 
 
 def make(setting: Setting) -> Bonus:
-    """The reward log(1 + length of the forward error), positive."""
+    """Makes the bonus log(1 + length of the forward error), positive."""
     icm = build(setting)
     return Bonus(
         init=functools.partial(init, icm),
@@ -54,7 +55,7 @@ def make(setting: Setting) -> Bonus:
 
 
 def build(setting: Setting) -> Icm:
-    """The fixed part, for a setting. Models have one hidden layer, as in URLB."""
+    """Makes the static part. Models have one hidden layer, as in URLB."""
     return Icm(
         setting=setting,
         trunk=Trunk(EMBEDDING_SIZE),
@@ -65,7 +66,7 @@ def build(setting: Setting) -> Icm:
 
 
 def init(icm: Icm, key: jax.Array) -> Learned:
-    """Fresh networks."""
+    """Returns random networks."""
     key_trunk, key_forward, key_inverse = jax.random.split(key, 3)
     observation = jnp.zeros((1, icm.setting.observation_size))
     embedding = jnp.zeros((1, EMBEDDING_SIZE))
@@ -79,13 +80,13 @@ def init(icm: Icm, key: jax.Array) -> Learned:
 
 
 def reward(icm: Icm, state: Learned, steps: Steps) -> tuple[Learned, jax.Array]:
-    """log(1 + length of the forward error)."""
+    """Returns log(1 + length of the forward error), [B]."""
     forward, _ = errors(icm, state.parameters, steps)
     return state, jnp.log1p(forward)
 
 
 def learn(icm: Icm, state: Learned, steps: Steps, key: jax.Array) -> tuple[Learned, Metrics]:
-    """One gradient step of all three networks."""
+    """Takes one gradient step of all three networks."""
     del key
 
     def loss(parameters):
@@ -97,13 +98,13 @@ def learn(icm: Icm, state: Learned, steps: Steps, key: jax.Array) -> tuple[Learn
 
 
 def embed(icm: Icm, parameters: Parameters, observation: jax.Array) -> jax.Array:
-    """[B, D] -> [B, F] in [-1, 1]."""
+    """Embeds observations, [B, D] -> [B, F] in [-1, 1]."""
     inputs = protocol.scaled(icm.setting, observation)
     return cast(jax.Array, icm.trunk.apply(parameters.trunk, inputs))
 
 
 def errors(icm: Icm, parameters: Parameters, steps: Steps) -> tuple[jax.Array, jax.Array]:
-    """Lengths [B] of what the forward and the inverse model are off by."""
+    """Returns the lengths of the forward and the inverse model's errors, [B] each."""
     before = embed(icm, parameters, steps.observation)
     after = embed(icm, parameters, steps.next_observation)
     cause = jnp.concatenate([before, steps.action], axis=-1)

@@ -1,12 +1,12 @@
-"""k-means MaxEnt: by how much a state would spread the centres of all states met.
+"""k-means MaxEnt: by how much a state would spread the centres of all states seen so far.
 
 Nedergaard & Cook 2022, "k-means maximum entropy exploration", arXiv 2205.15623, and its code
-(github.com/axnedergaard/kme). Centres follow the states, each state the nearest, where a centre
-that has had few counts as nearer. Sum over the centres of f(distance to the nearest other) bounds
-the entropy from below, with f a root in the code's experiments; the reward is what one step towards
-the state would add to it, from centres that stay put while a batch is paid (`coupled: False`).
-Their C++ offsets distances between centres by their counts too, their later Python does not, as
-here; centres start at the origin in the former, uniform in [-1, 1] in the latter and here.
+(github.com/axnedergaard/kme). Each state moves its nearest centre; a centre that few states have
+moved counts as nearer. The sum over the centres of f(distance to the nearest other) is a lower
+bound of the entropy; f is a root in the code's experiments. The reward is what one step towards the
+state would add to the sum; the centres do not move while a batch is rewarded (`coupled: False`).
+Their C++ also offsets distances between centres by their counts, and starts the centres at the
+origin. Their later Python does not, and starts them uniformly in [-1, 1]; we do the same.
 """
 
 import functools
@@ -21,19 +21,19 @@ from maxent_jax.types import Metrics
 
 # k, learning_rate, balancing_strength and power_fn_exponent of mujoco/train.yaml.
 NUM_CENTERS, STEP, BALANCE, EXPONENT = 300, 0.05, 1e-4, 0.5
-# States of a batch that are followed, one after the other: all in `quick` and `paper`.
+# States of a batch that move a centre, one after the other: all in `quick` and `paper`.
 MAX_FOLLOWED = 128
 
 
 class State(NamedTuple):
-    """Where the centres are, in scaled observations, and how many states each has followed."""
+    """The centres, in scaled observations, and how many states have moved each."""
 
     centers: jax.Array  # [C, D]
     counts: jax.Array  # [C] int32
 
 
 def make(setting: Setting) -> Bonus:
-    """The reward: how much wider apart the centres would be, of either sign."""
+    """Makes the bonus: by how much the centres would spread, of either sign."""
     return Bonus(
         init=functools.partial(init, setting),
         reward=functools.partial(reward, setting),
@@ -42,14 +42,14 @@ def make(setting: Setting) -> Bonus:
 
 
 def init(setting: Setting, key: jax.Array) -> State:
-    """Centres uniform in [-1, 1]."""
+    """Draws centres uniformly from [-1, 1]."""
     shape = (NUM_CENTERS, setting.observation_size)
     centers = jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
     return State(centers, jnp.zeros(NUM_CENTERS, jnp.int32))
 
 
 def reward(setting: Setting, state: State, steps: Steps) -> tuple[State, jax.Array]:
-    """What each state alone would add to the sum of roots, were its centre to follow it."""
+    """Returns what each state alone would add to the sum of roots by moving its centre, [B]."""
     states = protocol.scaled(setting, steps.next_observation)
     chosen = nearest_center(state, states)
     moved = _moved(state.centers[chosen], states)
@@ -57,7 +57,7 @@ def reward(setting: Setting, state: State, steps: Steps) -> tuple[State, jax.Arr
 
 
 def learn(setting: Setting, state: State, steps: Steps, key: jax.Array) -> tuple[State, Metrics]:
-    """States of the batch one after the other, in a random order, each moving its centre."""
+    """Lets the states of the batch move their centres, one after the other in random order."""
     states = jax.random.permutation(key, protocol.scaled(setting, steps.next_observation))
     states = states[:MAX_FOLLOWED]
 
@@ -73,21 +73,21 @@ def learn(setting: Setting, state: State, steps: Steps, key: jax.Array) -> tuple
 
 
 def nearest_center(state: State, states: jax.Array) -> jax.Array:
-    """[B, D] -> [B] int: the least of distance + κ (count - mean count)."""
+    """Returns the centre with the least distance + κ (count - mean count), [B, D] -> [B] int."""
     counts = state.counts.astype(jnp.float32)
     offset = BALANCE * (counts - jnp.mean(counts))
     return jnp.argmin(_distances(states, state.centers) + offset[None], axis=-1)
 
 
 def gains(centers: jax.Array, chosen: jax.Array, moved: jax.Array) -> jax.Array:
-    """By how much the sum over centres of f(distance to the nearest other) would rise.
+    """Returns by how much the sum over centres of f(distance to the nearest other) would rise.
 
     Args:
       centers: [C, D].
-      chosen: [B] int, the centre that moves, alone.
-      moved: [B, D] where to.
+      chosen: [B] int, the only centre that moves.
+      moved: [B, D] its new place.
     Returns:
-      [B].
+      [B] the rise.
     """
     own = jnp.arange(centers.shape[0])
     between = jnp.where(jnp.eye(own.size, dtype=bool), jnp.inf, _distances(centers, centers))
@@ -108,5 +108,5 @@ def _moved(center: jax.Array, state: jax.Array) -> jax.Array:
 
 
 def _distances(points: jax.Array, others: jax.Array) -> jax.Array:
-    """[B, D], [C, D] -> [B, C], by differences, of which no small one is lost."""
+    """[B, D], [C, D] -> [B, C], by differences, so that no small distance is lost."""
     return jnp.sqrt(jnp.sum((points[:, None] - others[None]) ** 2, axis=-1))

@@ -1,11 +1,11 @@
-"""NGU: novelty within the episode, times how new a state is to the agent as a whole.
+"""NGU: novelty within the episode, times novelty over the agent's whole life.
 
 Badia et al. 2020, "Never give up: learning directed exploration strategies", arXiv 2002.06038,
 Eq. 1 and Algorithm 1; there is no official code. States are compared in an embedding from which an
-inverse model finds the action, trained by the squared error (a Gaussian likelihood) where the
-paper's actions are discrete. The paper recomputes embeddings with a copy that is refreshed once an
-episode; an embedding here is that of the moment at which its state is met. Left out: the weight
-decay of 1e-5, and Algorithm 1's cut at a similarity of 8, which 10 neighbours never reach.
+inverse model predicts the action. The loss is the squared error (a Gaussian likelihood); in the
+paper actions are discrete. The paper recomputes embeddings with a copy that is refreshed once per
+episode; here an embedding is computed once, when its state is reached. Left out: the weight decay
+of 1e-5, and Algorithm 1's cut at a similarity of 8, which 10 neighbours never reach.
 """
 
 import functools
@@ -39,11 +39,11 @@ CLUSTER_DISTANCE = 0.008  # ξ
 PSEUDO_COUNT = 1e-3  # c
 MODULATOR_LIMIT = 5.0  # L
 EMBEDDING_SIZE = 32
-MEAN_FLOOR = 1e-12  # of the mean squared distance, where all states met so far are one
+MEAN_FLOOR = 1e-12  # of the mean squared distance, if all states so far are equal
 
 
 class Ngu(NamedTuple):
-    """The fixed part."""
+    """The static part."""
 
     setting: Setting
     rnd: Rnd
@@ -60,7 +60,7 @@ class Parameters(NamedTuple):
 
 
 class State(NamedTuple):
-    """RND's, the embedding's, and the running mean of squared distances."""
+    """RND's state, the embedding, and the running mean of squared distances."""
 
     rnd: rnd.State
     controllable: Learned
@@ -68,7 +68,7 @@ class State(NamedTuple):
 
 
 def make(setting: Setting) -> Bonus:
-    """The reward episodic novelty × clip(1 + (error - mean) / std, 1, 5), positive."""
+    """Makes the bonus episodic novelty × clip(1 + (error - mean) / std, 1, 5), positive."""
     ngu = Ngu(
         setting=setting,
         rnd=rnd.build(setting),
@@ -89,7 +89,7 @@ def make(setting: Setting) -> Bonus:
 
 
 def init(ngu: Ngu, key: jax.Array) -> State:
-    """Fresh networks, and normalisers that have met nothing."""
+    """Returns random networks, and empty normalisers."""
     key_rnd, key_embedding, key_inverse = jax.random.split(key, 3)
     observation = jnp.zeros((1, ngu.setting.observation_size))
     parameters = Parameters(
@@ -104,23 +104,25 @@ def init(ngu: Ngu, key: jax.Array) -> State:
 
 
 def embed(ngu: Ngu, state: State, observation: jax.Array) -> jax.Array:
-    """The controllable part of states, [N, D] -> [N, F]."""
+    """Embeds states, [N, D] -> [N, F]."""
     return _embedding(ngu, state.controllable.parameters, observation)
 
 
 def novelty(
     ngu: Ngu, state: State, embedding: jax.Array, earlier: jax.Array, count: jax.Array
 ) -> tuple[State, jax.Array]:
-    """How new each state is within its episode; the running mean of squared distances advances.
+    """Returns how new each state is within its episode; updates the mean of squared distances.
+
+    Novelty is 1 / (sqrt(sum of kernels over the 10 nearest) + c): 0.3 where all ten coincide with
+    the state, about 30 at their mean distance, 1000 without any. It is higher with fewer than ten,
+    as in Algorithm 1.
 
     Args:
       embedding: [N, F].
-      earlier: [N, T, F] those of the states before; the first `count` are filled.
+      earlier: [N, T, F] of the episode's earlier states; the first `count` are filled.
       count: [N] int.
     Returns:
-      The state, and [N] 1 / (sqrt(sum of kernels over the 10 nearest) + c), from 0.3 where all ten
-      coincide with it, about 30 at their mean distance, to 1000 with none before. The fewer there
-      are, the higher, as in Algorithm 1.
+      The state, and the novelty [N].
     """
     del ngu
     squared = jnp.sum((earlier - embedding[:, None]) ** 2, axis=-1)
@@ -135,7 +137,7 @@ def novelty(
 
 
 def reward(ngu: Ngu, state: State, steps: Steps) -> tuple[State, jax.Array]:
-    """The stored novelty, times RND's modulator, whose normalisers advance before they are used."""
+    """Returns the stored novelty times RND's modulator, [B]; updates RND's normalisers first."""
     lifelong, error = rnd.advance(ngu.rnd, state.rnd, steps)
     std = jnp.sqrt(lifelong.errors.variance) + rnd.STD_FLOOR
     modulator = jnp.clip(1 + (error - lifelong.errors.mean) / std, 1.0, MODULATOR_LIMIT)
@@ -143,7 +145,7 @@ def reward(ngu: Ngu, state: State, steps: Steps) -> tuple[State, jax.Array]:
 
 
 def learn(ngu: Ngu, state: State, steps: Steps, key: jax.Array) -> tuple[State, Metrics]:
-    """One gradient step of RND's predictor, and one of embedding and inverse model."""
+    """Takes one gradient step of RND's predictor, and one of the embedding and inverse model."""
 
     def loss(parameters):
         before = _embedding(ngu, parameters, steps.observation)

@@ -1,10 +1,10 @@
-"""What a bonus is: an intrinsic reward with a state of its own, as pure functions.
+"""The interface of a bonus: an intrinsic reward with a state, as pure functions.
 
-Every bonus pays for the state that a transition reached. It meets transitions drawn from a replay,
+Every bonus rewards the state that a transition reached. It sees transitions drawn from a replay,
 as in URLB (Laskin et al. 2021, github.com/rll-research/url_benchmark): what its method computes
-from the newest rollout, it computes from the batch. Rewards are computed for all minibatches of a
-step of all envs together, before it learns from one after the other. What it is shown as a state's
-observation is φ of it.
+from the newest rollout, it computes from the batch. It computes the rewards of all minibatches of a
+vector step together, and then learns from one minibatch after the other. The observations that it
+sees are features φ(s).
 """
 
 from collections.abc import Callable
@@ -18,26 +18,26 @@ from maxent_jax.types import Metrics
 State = Any
 """A pytree of fixed shapes and dtypes."""
 
-# Of every network here. URLB has 1024 units; 256 is the size of the paper's own actor and critics.
+# Of every bonus network. URLB has 1024 units; 256 is the size of the paper's actor and critics.
 HIDDEN_LAYERS, HIDDEN_SIZE = 2, 256
-# Of the embeddings in which distances are measured: RE3's feature_dim, and that of VCSE's ICM.
+# Of embeddings in which distances are measured: RE3's feature_dim, and that of VCSE's ICM.
 EMBEDDING_SIZE = 50
 
 
 class Steps(NamedTuple):
-    """A batch of transitions as a bonus sees them."""
+    """A batch of transitions, as a bonus sees it."""
 
     observation: jax.Array  # [B, D]
     action: jax.Array  # [B, A], in [-1, 1]
     next_observation: jax.Array  # [B, D]
-    value: jax.Array  # [B] what the critics expect from next_observation on
-    episodic: jax.Array  # [B] what Episodic.novelty gave when the step was taken; 0 without one
-    row: jax.Array  # [B] int32, equal for one and the same transition, drawn more than once
-    cell: jax.Array | None = None  # [B] int32 of the grid, that the step reached; num_cells off it
+    value: jax.Array  # [B] the critics' value of next_observation
+    episodic: jax.Array  # [B] from Episodic.novelty when the step was taken; 0 without it
+    row: jax.Array  # [B] int32, equal for copies of one transition that was drawn more than once
+    cell: jax.Array | None = None  # [B] int32 of the grid, where the step arrived; num_cells off it
 
 
 class Episodic(NamedTuple):
-    """What is computed when a step is taken, because it depends on the episode so far."""
+    """The part that is computed when a step is taken, since it depends on the episode so far."""
 
     size: int  # F of an embedding
     embed: Callable[[State, jax.Array], jax.Array]
@@ -45,52 +45,52 @@ class Episodic(NamedTuple):
     novelty: Callable[[State, jax.Array, jax.Array, jax.Array], tuple[State, jax.Array]]
     """state, embedding [N, F], earlier [N, T, F], count [N] -> state, [N]
 
-    Of the embeddings of the states before, each episode's first `count` are filled.
+    `earlier` holds the embeddings of each episode's earlier states; the first `count` are filled.
     """
 
 
 class Bonus(NamedTuple):
-    """The functions can be jitted, and mapped over seeds; the state can be carried by a scan."""
+    """Functions that can be jitted and mapped over seeds; a scan can carry the state."""
 
     init: Callable[[jax.Array], State]
     """key -> state"""
     reward: Callable[[State, Steps], tuple[State, jax.Array]]
-    """state, steps -> state with its running normalisers advanced, reward [B]"""
+    """state, steps -> state with updated running normalisers, reward [B]"""
     learn: Callable[[State, Steps, jax.Array], tuple[State, Metrics]]
-    """state, steps, key -> state after one step of learning; the same where nothing is learned"""
+    """state, steps, key -> state after one step of learning; unchanged if it does not learn"""
     episodic: Episodic | None = None
     refresh: Callable[[State, jax.Array], State] | None = None
-    """state, share [bins, bins] of the mixture's states in each cell -> state, as an iteration
-    begins"""
+    """state, share [bins, bins] of the mixture's states in each cell -> state; called when an
+    iteration begins"""
 
 
 class Setting(NamedTuple):
-    """What every bonus is made from."""
+    """The arguments from which every bonus is made."""
 
     observation_size: int
     action_size: int
-    scale: jax.Array  # [D] what counts as 1 of each observation
+    scale: jax.Array  # [D] the unit of each entry of an observation
     learning_rate: float
     num_cells: int  # of the grid on which coverage is counted
 
 
 def scaled(setting: Setting, observation: jax.Array) -> jax.Array:
-    """What networks and distances see of observations, [B, D]: in units of the scale."""
+    """Returns observations [B, D] in units of the scale, as networks and distances see them."""
     return observation / setting.scale[None]
 
 
 def optimizer(setting: Setting) -> optax.GradientTransformation:
-    """Adam, as in the code of every method here that learns by gradients."""
+    """Returns Adam, which every method here that learns by gradients has in its code."""
     return optax.adam(setting.learning_rate)
 
 
 def no_state(key: jax.Array) -> State:
-    """The `init` of a bonus that keeps nothing."""
+    """The `init` of a bonus without a state."""
     del key
     return ()
 
 
 def no_learning(state: State, steps: Steps, key: jax.Array) -> tuple[State, Metrics]:
-    """The `learn` of a bonus that learns nothing."""
+    """The `learn` of a bonus that does not learn."""
     del steps, key
     return state, {}

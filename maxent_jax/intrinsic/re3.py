@@ -1,11 +1,11 @@
-"""RE3: how far a state lies from its nearest in the batch, seen by a network that never learns.
+"""RE3: the distance from a state to its nearest in the batch, in a random embedding.
 
 Seo et al. 2021, "State entropy maximization with random encoders for efficient exploration", arXiv
 2102.09430: log(1 + R), R the distance to the k-th nearest. Their off-policy code
-(github.com/younggyoseo/RE3, `rad_re3`) looks for the nearest in the whole replay, not in the batch,
-and pays R / std(R), without the logarithm. Their encoder is convolutional, with layer norm and tanh
-at its end; for states it is here what k-means MaxEnt's code compared itself with
-(github.com/axnedergaard/kme), two hidden layers and neither of those.
+(github.com/younggyoseo/RE3, `rad_re3`) searches the whole replay, not the batch, and its reward is
+R / std(R), without the logarithm. Their encoder is convolutional and ends with layer norm and tanh.
+Ours, for states, is the one that the code of k-means MaxEnt compares with
+(github.com/axnedergaard/kme): two hidden layers, and neither of those.
 """
 
 import functools
@@ -30,14 +30,14 @@ NUM_NEIGHBORS = BONUSES["re3"].num_neighbors  # k of rad_re3/config.yaml
 
 
 class Re3(NamedTuple):
-    """The fixed part; the state is the encoder's weights."""
+    """The static part; the state is the encoder's weights."""
 
     setting: Setting
     encoder: Mlp
 
 
 def make(setting: Setting) -> Bonus:
-    """The reward log(1 + distance to the third nearest), positive."""
+    """Makes the bonus log(1 + distance to the third nearest), positive."""
     re3 = Re3(setting, Mlp(HIDDEN_LAYERS, HIDDEN_SIZE, EMBEDDING_SIZE))
     return Bonus(
         init=functools.partial(init, re3),
@@ -47,12 +47,12 @@ def make(setting: Setting) -> Bonus:
 
 
 def init(re3: Re3, key: jax.Array) -> Any:
-    """A random encoder."""
+    """Returns a random encoder."""
     return re3.encoder.init(key, jnp.zeros((1, re3.setting.observation_size)))
 
 
 def reward(re3: Re3, state: Any, steps: Steps) -> tuple[Any, jax.Array]:
-    """log(1 + R).
+    """Returns log(1 + R), [B].
 
     Raises:
       ValueError: B <= 3.

@@ -1,10 +1,11 @@
-"""RISE: a power of how far a state lies from its nearest in the batch; and Rényi's plain form.
+"""RISE: a power of the distance from a state to its nearest in the batch; and Rényi's plain form.
 
 Yuan, Pun & Wang 2022, "Rényi state entropy for exploration acceleration in reinforcement learning",
-arXiv 2203.04297: R^(1 - α), R the distance to the k-th nearest. Images are embedded by a VAE that a
-random policy trains; their code (github.com/yuanmingqi/RISE, `src/rise.py`) takes the states of
-continuous control as they are; here they are φ, in its units. Its k + 1 steps over the state itself
-and one more neighbour; ours is the k-th. The paper's search for k is not in its code, and not here.
+arXiv 2203.04297: R^(1 - α), R the distance to the k-th nearest. Images are embedded by a VAE, which
+is trained on a random policy. Their code (github.com/yuanmingqi/RISE, `src/rise.py`) uses the
+states of continuous control as they are; here they are φ, in its units. Its k + 1 skips the state
+itself and one more neighbour; ours is the k-th. The paper's search for k is not in its code, and
+not here.
 """
 
 import functools
@@ -20,7 +21,7 @@ NUM_NEIGHBORS, ORDER = BONUSES["rise"].num_neighbors, 0.1  # k and alpha of src/
 
 
 def make(setting: Setting) -> Bonus:
-    """The reward R^0.9, not negative."""
+    """Makes the bonus R^0.9, at least 0."""
     return Bonus(
         init=protocol.no_state,
         reward=functools.partial(reward, setting),
@@ -29,9 +30,9 @@ def make(setting: Setting) -> Bonus:
 
 
 def make_renyi(setting: Setting) -> Bonus:
-    """The reward 0.9 × -log of the kNN density, nats, of either sign.
+    """Makes the bonus 0.9 × -log of the kNN density, nats, of either sign.
 
-    With R^(D (1 - α)) for R^(1 - α) RISE's reward would be its exponential, up to a factor.
+    With R^(D (1 - α)) instead of R^(1 - α), RISE's reward would be its exponential, up to a factor.
     """
     return Bonus(
         init=protocol.no_state,
@@ -43,7 +44,7 @@ def make_renyi(setting: Setting) -> Bonus:
 def reward(
     setting: Setting, state: State, steps: Steps, order: float = ORDER
 ) -> tuple[State, jax.Array]:
-    """R^(1 - α): at order α = 0 linear in R; towards 1 it no longer tells states apart.
+    """Returns R^(1 - α), [B]: linear in R at α = 0, almost equal for all states as α nears 1.
 
     Raises:
       ValueError: B <= 5.
@@ -53,7 +54,9 @@ def reward(
 
 
 def renyi_reward(setting: Setting, state: State, steps: Steps) -> tuple[State, jax.Array]:
-    """(α - 1) log p of each state among the others of the batch, as rewards.renyi_reward, nats.
+    """Returns (α - 1) log p of each state among the others of the batch, [B] nats.
+
+    As rewards.renyi_reward.
 
     Raises:
       ValueError: B <= 5.

@@ -1,10 +1,10 @@
-"""RND: how badly a network predicts what another, fixed one makes of a state.
+"""RND: the error of a network that predicts the output of another, fixed one.
 
 Burda et al. 2018, "Exploration by random network distillation", arXiv 1810.12894. Their code
-(github.com/openai/random-network-distillation) divides by the standard deviation of the discounted
-return of the reward; URLB, which pays transitions in no order, by that of the reward, as we do.
-URLB normalises observations by the batch; we, as they, by all met so far. Their predictor has two
-layers more than the target; here, as in URLB, it has the target's.
+(github.com/openai/random-network-distillation) divides by the standard deviation of the reward's
+discounted return. URLB, whose transitions have no order, divides by that of the reward, as we do.
+URLB normalises observations over the batch; we do so over all observations so far, as RND's authors
+do. Their predictor has two layers more than the target; ours has the target's layers, as in URLB.
 """
 
 import functools
@@ -24,12 +24,12 @@ from maxent_jax.types import Metrics
 
 OUTPUT_SIZE = 512  # rep_size of their code, rnd_rep_dim of URLB
 OBSERVATION_LIMIT = 5.0  # standard deviations (2.4 of the paper)
-VARIANCE_FLOOR = 1e-5  # of an observation, in units of its scale: that of URLB's batch norm
+VARIANCE_FLOOR = 1e-5  # of an observation, in units of its scale; from URLB's batch norm
 STD_FLOOR = 1e-8  # of the error: URLB
 
 
 class Rnd(NamedTuple):
-    """The fixed part."""
+    """The static part."""
 
     setting: Setting
     network: Mlp
@@ -37,7 +37,7 @@ class Rnd(NamedTuple):
 
 
 class State(NamedTuple):
-    """What is fixed for a seed, what is learned, and the running normalisers."""
+    """The fixed target, the predictor, and the running normalisers."""
 
     target: Any
     predictor: Learned
@@ -46,7 +46,7 @@ class State(NamedTuple):
 
 
 def make(setting: Setting) -> Bonus:
-    """The reward error / std(error), positive."""
+    """Makes the bonus error / std(error), positive."""
     rnd = build(setting)
     return Bonus(
         init=functools.partial(init, rnd),
@@ -56,13 +56,13 @@ def make(setting: Setting) -> Bonus:
 
 
 def build(setting: Setting) -> Rnd:
-    """The fixed part, for a setting."""
+    """Makes the static part."""
     network = Mlp(HIDDEN_LAYERS, HIDDEN_SIZE, OUTPUT_SIZE)
     return Rnd(setting, network, protocol.optimizer(setting))
 
 
 def init(rnd: Rnd, key: jax.Array) -> State:
-    """A fresh predictor and target, and normalisers that have met nothing."""
+    """Returns a random predictor and target, and empty normalisers."""
     key_target, key_predictor = jax.random.split(key)
     inputs = jnp.zeros((1, rnd.setting.observation_size))
     return State(
@@ -74,13 +74,13 @@ def init(rnd: Rnd, key: jax.Array) -> State:
 
 
 def reward(rnd: Rnd, state: State, steps: Steps) -> tuple[State, jax.Array]:
-    """Both normalisers advance before they are used."""
+    """Returns the reward [B]; both normalisers are updated before they are used."""
     state, error = advance(rnd, state, steps)
     return state, error / (jnp.sqrt(state.errors.variance) + STD_FLOOR)
 
 
 def advance(rnd: Rnd, state: State, steps: Steps) -> tuple[State, jax.Array]:
-    """The state that has met the steps, and the error of each, [B], unnormalised."""
+    """Updates the normalisers with the steps; also returns their errors [B], not normalised."""
     met = protocol.scaled(rnd.setting, steps.next_observation)
     state = state._replace(observations=moments.update(state.observations, met))
     error = prediction_error(rnd, state, state.predictor.parameters, steps)
@@ -88,7 +88,7 @@ def advance(rnd: Rnd, state: State, steps: Steps) -> tuple[State, jax.Array]:
 
 
 def learn(rnd: Rnd, state: State, steps: Steps, key: jax.Array) -> tuple[State, Metrics]:
-    """One gradient step of the predictor; the normalisers stay."""
+    """Takes one gradient step of the predictor; the normalisers do not change."""
     del key
 
     def loss(parameters):
@@ -100,7 +100,7 @@ def learn(rnd: Rnd, state: State, steps: Steps, key: jax.Array) -> tuple[State, 
 
 
 def prediction_error(rnd: Rnd, state: State, parameters: Any, steps: Steps) -> jax.Array:
-    """[B] mean squared difference from the target's output, of a predictor of these parameters."""
+    """Returns the mean squared error of a predictor with these parameters, [B]."""
     seen = state.observations
     std = jnp.sqrt(seen.variance + VARIANCE_FLOOR)
     inputs = (protocol.scaled(rnd.setting, steps.next_observation) - seen.mean[None]) / std[None]

@@ -1,13 +1,13 @@
 """VCSE: the entropy of states among those of the same value.
 
 Kim et al. 2023, "Accelerating reinforcement learning with value-conditional state entropy
-exploration", arXiv 2305.19476: ψ(n + 1) / D + log 2ε, where ε is the distance to the k-th nearest
-in the larger of the distances of states and of values, and n counts the values nearer than ε, after
-Kraskov, Stögbauer & Grassberger 2004. As in their code (github.com/kingdy2002/VCSE, `VCSE_SAC`),
-states are divided by D too, values normalised over the batch, and 1e-5 is added within the
-logarithm. Their k and n count the state itself; ours, as Kraskov's, do not. Their value is
-that of the mean action, by a critic of the task's reward alone; without such a reward it is the
-learner's own, of an action drawn, with its entropy.
+exploration", arXiv 2305.19476: ψ(n + 1) / D + log 2ε. ε is the distance to the k-th nearest, where
+a distance is the larger of that between states and that between values; n counts the values nearer
+than ε (after Kraskov, Stögbauer & Grassberger 2004). As in their code
+(github.com/kingdy2002/VCSE, `VCSE_SAC`), states are also divided by D, values are normalised over
+the batch, and 1e-5 is added inside the logarithm. Their k and n count the state itself; ours do
+not, nor do Kraskov's. Their value is that of the mean action, from a critic of the task's reward
+alone. Here no such reward exists: the value is the learner's, of a drawn action, with its entropy.
 """
 
 import functools
@@ -23,13 +23,13 @@ from maxent_jax.intrinsic.protocol import Bonus, Setting, State, Steps
 
 NUM_NEIGHBORS = BONUSES["vcse"].num_neighbors  # knn_k of VCSE_SAC/config/agent/sac.yaml
 LOG_OFFSET = 1e-5  # of their code
-VARIANCE_FLOOR = 1e-5  # of the values: that of their layer norm
+VARIANCE_FLOOR = 1e-5  # of the values; from their layer norm
 ROUNDING = 1e-6
-ROWS = 256  # states measured at once, so that memory grows with B and not with its square
+ROWS = 256  # states measured at once, so that memory grows with B, not with its square
 
 
 def make(setting: Setting) -> Bonus:
-    """The reward ψ(n + 1) / D + log(2ε + 1e-5), nats for each dimension, of either sign."""
+    """Makes the bonus ψ(n + 1) / D + log(2ε + 1e-5), nats per dimension, of either sign."""
     return Bonus(
         init=protocol.no_state,
         reward=functools.partial(reward, setting),
@@ -38,7 +38,7 @@ def make(setting: Setting) -> Bonus:
 
 
 def reward(setting: Setting, state: State, steps: Steps) -> tuple[State, jax.Array]:
-    """Of each state among the others of the batch.
+    """Returns the reward of each state among the others of the batch, [B].
 
     Raises:
       ValueError: B <= 12.
@@ -55,17 +55,16 @@ def reward(setting: Setting, state: State, steps: Steps) -> tuple[State, jax.Arr
 def joint_neighbors(
     states: jax.Array, values: jax.Array, rows: jax.Array, num_neighbors: int
 ) -> tuple[jax.Array, jax.Array]:
-    """What Kraskov's first estimator is made of, of each row among the others.
+    """Returns the terms of Kraskov's first estimator, of each row among the others.
 
     Args:
       states: [B, F].
       values: [B].
-      rows: [B] int32, equal for copies of one transition, which are no others.
+      rows: [B] int32, equal for copies of one transition, which do not count as others.
       num_neighbors: k.
     Returns:
       [B] ε, to the k-th nearest in max(distance of states, distance of values), or to the farthest
-      where copies leave fewer than k others; and [B] int32, how
-      many values lie nearer than ε.
+        if copies leave fewer than k others; and [B] int32, how many values are nearer than ε.
     Raises:
       ValueError: B <= k.
     """
@@ -78,7 +77,7 @@ def joint_neighbors(
         other = rows != own
         joint = jnp.where(other, jnp.maximum(apart, value_apart), jnp.inf)
         distance = particles.filled(smallest_k(joint, num_neighbors))[-1]
-        # ε is often itself a distance of values, of which XLA may make another in its last bit.
+        # ε is often a distance of values itself, whose last bit XLA may compute differently here.
         nearer = value_apart < distance * (1 - ROUNDING)
         return distance, jnp.sum(other & nearer, dtype=jnp.int32)
 

@@ -1,4 +1,4 @@
-"""The archive: every policy of the mixture, as one pytree."""
+"""The archive: all policies of the mixture, as one pytree."""
 
 from typing import NamedTuple
 
@@ -9,20 +9,20 @@ from maxent_jax.sac.agent import Parameters
 
 
 class Archive(NamedTuple):
-    """The first `size` of P slots hold a policy; the others are masked by weight 0."""
+    """P slots: the first `size` hold a policy, and the others have weight 0."""
 
     parameters: Parameters  # [P, ...]
     size: jax.Array  # int32
 
 
 def init(parameters: Parameters, capacity: int) -> Archive:
-    """An empty archive for agents of that shape."""
+    """Returns an empty archive with `capacity` slots for agents of this shape."""
     empty = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), parameters)
     return Archive(empty, jnp.zeros((), jnp.int32))
 
 
 def append(archive: Archive, parameters: Parameters, due: jax.Array | bool = True) -> Archive:
-    """With one more policy if `due`, [] bool. Beyond the last slot nothing is stored."""
+    """Adds a policy if `due`, [] bool; a full archive stays as it is."""
     capacity = jax.tree.leaves(archive.parameters)[0].shape[0]
     slot = jnp.where(due, archive.size, capacity)
     stored = jax.tree.map(
@@ -32,5 +32,5 @@ def append(archive: Archive, parameters: Parameters, due: jax.Array | bool = Tru
 
 
 def policy(archive: Archive, index: jax.Array) -> Parameters:
-    """The agent in the slots `index` [...], with those axes in front of each leaf."""
+    """Returns the agents in the slots `index` [...]; each leaf becomes [..., *its shape]."""
     return jax.tree.map(lambda slots: slots[index], archive.parameters)

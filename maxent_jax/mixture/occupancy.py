@@ -1,4 +1,4 @@
-"""The states that a mixture visits: rolled out, weighted, sampled, and scored by policy."""
+"""The states that a mixture visits: rolls them out, weighs them, and scores the policies."""
 
 from typing import NamedTuple
 
@@ -18,22 +18,22 @@ from maxent_jax.types import Metrics
 
 
 class Occupancy(NamedTuple):
-    """R = T·E states of E episodes, with their share of the mixture's occupancy."""
+    """The R = T·E states of E episodes, each with its share of the mixture's occupancy."""
 
     states: jax.Array  # [R, D]
     features: jax.Array  # [R, F]
-    policy: jax.Array  # [R] int32, who reached it
+    policy: jax.Array  # [R] int32, the policy that reached the state
     weight: jax.Array  # [R], sums to 1; 0 after an episode's end, or for a policy of weight 0
-    alive: jax.Array  # [R] bool: reached before its episode's end
+    alive: jax.Array  # [R] bool: reached before the episode's end
     episode_policy: jax.Array  # [E] int32
     num_invalid: jax.Array  # [] int32
 
 
 class Scores(NamedTuple):
-    """How each archived policy does under r_t, unshaped; 0 for an empty slot."""
+    """What each archived policy earns under r_t, unshaped; 0 for an empty slot."""
 
-    episode_return: jax.Array  # [P] undiscounted, mean over its episodes
-    step_reward: jax.Array  # [P] mean over its states
+    episode_return: jax.Array  # [P] undiscounted, mean over the policy's episodes
+    step_reward: jax.Array  # [P] mean over the policy's states
 
 
 def of_mixture(
@@ -45,18 +45,20 @@ def of_mixture(
     only_weighted: bool = False,
     deterministic: bool = False,
 ) -> Occupancy:
-    """Rolls the mixture out, one policy for each episode.
+    """Rolls the mixture out; one policy plays each episode.
 
-    Unless the config pools, policies play equal numbers of episodes, up to one, and the states of
-    each share its weight: episodes end early when health fails, and a pooled sample would weigh
-    policies by how long they live. Pooled, policies are drawn by weight and all states count alike;
-    and so they do where the config draws a policy by weight for each step.
+    By default the policies play equal numbers of episodes (they differ by at most one), and the
+    states of a policy share its weight. Health termination ends episodes early, so a pooled sample
+    would give long-lived policies more weight. With `pooled`, policies are drawn by weight and all
+    states count the same; so do they where the config draws a policy by weight at each step.
 
     Args:
-      weights: [P].
-      starts: [E, ...].
-      only_weighted: spend no episode on a policy of weight 0.
-      deterministic: act by the policies' means.
+      weights: [P] of the policies.
+      starts: [E, ...] first states.
+      only_weighted: a policy of weight 0 plays no episode.
+      deterministic: the policies act by their means.
+    Returns:
+      The occupancy, R = T·E states.
     """
     key_assign, key_act = jax.random.split(key)
     num_episodes = starts.done.shape[0]
@@ -80,10 +82,12 @@ def of_mixture(
 def corrected(
     components: Components, occupancy: Occupancy, weights: jax.Array
 ) -> tuple[Occupancy, jax.Array]:
-    """The same states with fully corrective weights where the config has them, and the weights.
+    """Reweighs the states by fully corrective weights, if the config asks for them.
 
     Args:
       weights: [P] with which the occupancy was made.
+    Returns:
+      The occupancy and the weights [P]; both unchanged under any other kind of weights.
     """
     if components.config.mixture.weights != CORRECTIVE:
         return occupancy, weights
@@ -110,13 +114,17 @@ def of_episodes(
     num_invalid: jax.Array,
     alike: bool = False,
 ) -> Occupancy:
-    """The states of episodes that were played, weighted as of_mixture says.
+    """Makes an occupancy from episodes that were played, weighted as in `of_mixture`.
 
     Args:
-      weights: [P].
-      episode_policy: [E] int32, who played each.
-      states, alive: [T, E, D] and [T, E] bool, as in Trajectories.
-      alike: every state counts the same, whoever reached it.
+      weights: [P] of the policies.
+      episode_policy: [E] int32, the policy that played each episode.
+      states: [T, E, D], as in Trajectories.
+      alive: [T, E] bool, as in Trajectories.
+      num_invalid: [] int32, states that were not finite.
+      alike: every state counts the same, whichever policy reached it.
+    Returns:
+      The occupancy, R = T·E states.
     """
     states = states.reshape(-1, states.shape[-1])
     policy = jnp.broadcast_to(episode_policy, alive.shape).reshape(-1)
@@ -145,9 +153,9 @@ def play(
     key: jax.Array,
     deterministic: bool = False,
 ) -> Trajectories:
-    """Episodes from `starts` [E, ...], each played by the policy in its slot, [E] int32.
+    """Plays an episode from each of `starts` [E, ...] by the policy in slot `episode_policy` [E].
 
-    Every episode holds its own copy of the actor's weights: E times their size in memory.
+    Each episode holds its own copy of the actor's weights: E times their size in memory.
     """
     policies = mixture.policy(archive, episode_policy).policy
 
@@ -160,11 +168,9 @@ def play(
 
 
 def _act_by_any(components: Components, archive: Archive, weights: jax.Array, deterministic: bool):
-    """observation [E, D], key -> [E, A] by a policy drawn by weight for each episode's step.
+    """observation [E, D], key -> [E, A], by a policy drawn by weight at each step of an episode."""
 
-    All policies act, and one action is taken: weights of networks are not moved.
-    """
-
+    # All policies act and one action is taken: this copies no network weights.
     def act(observation, key_step):
         key_draw, key_act = jax.random.split(key_step)
         keys = jax.random.split(key_act, weights.shape[0])
@@ -194,21 +200,24 @@ def score(
     archive: Archive,
     num_filled: jax.Array | None = None,
 ) -> Scores:
-    """Each policy's return under the reward that the reference points define.
+    """Scores each policy by its return under the reward that the reference points define.
+
+    A state leaves itself out of the reference. With `leave_own_out` it also leaves out the states
+    of its own policy and of policies that the same iteration archived, unless fewer than k points
+    would remain. Points of a history have no row, so a state that is in the history sees itself.
 
     Args:
       points: [M, F] the reference.
-      rows: [M] int32, which row of the occupancy each point is; -1 for none. A state does not see
-        itself, nor, with leave_own_out, any state of its own policy or of others that the same
-        iteration archived, unless that leaves fewer than k. Points of a history carry no row: a
-        state that entered it is not told apart.
-      archive: whose policies are scored.
-      num_filled: [] how many of the points are there; all when left out.
+      rows: [M] int32, each point's row in the occupancy; -1 for none.
+      archive: the policies to score.
+      num_filled: [] int32, how many of the points are filled; all of them if None.
+    Returns:
+      The scores, [P] each.
     """
     config = components.config
     num_rows = occupancy.policy.shape[0]
     capacity = jax.tree.leaves(archive.parameters)[0].shape[0]
-    label = capacity + jnp.arange(num_rows, dtype=jnp.int32)  # by itself, or by its iteration
+    label = capacity + jnp.arange(num_rows, dtype=jnp.int32)  # a state's own, or its iteration's
     if config.mixture.leave_own_out:
         iteration = (occupancy.policy + config.mixture.snapshots - 1) // config.mixture.snapshots
         owner = jnp.where(rows < 0, -1, iteration[rows])
@@ -235,14 +244,14 @@ def score(
 
 
 def best(scores: Scores, occupancy: Occupancy) -> jax.Array:
-    """[] int32: the policy of highest return among those that played."""
+    """Returns the policy with the highest return among those that played, [] int32."""
     capacity = scores.episode_return.shape[0]
     played = jnp.zeros(capacity, bool).at[occupancy.episode_policy].set(True)
     return jnp.argmax(jnp.where(played, scores.episode_return, -jnp.inf)).astype(jnp.int32)
 
 
 def measures(components: Components, occupancy: Occupancy, key: jax.Array) -> Metrics:
-    """Coverage and entropies of the mixture, on the environment's grid and in feature space."""
+    """Measures the mixture's coverage and entropies (nats), on the grid and in feature space."""
     config = components.config
     cells = histogram.count(occupancy.states, components.grid, occupancy.weight)
     rows = mixture.draw_rows(occupancy.weight, config.mixture.reference_size, key)
@@ -250,7 +259,7 @@ def measures(components: Components, occupancy: Occupancy, key: jax.Array) -> Me
     return {
         "mixture_coverage": histogram.coverage(cells),
         "mixture_entropy": histogram.shannon_entropy(cells),
-        "mixture_off_grid_share": jnp.maximum(1 - jnp.sum(cells), 0.0),  # sums round
+        "mixture_off_grid_share": jnp.maximum(1 - jnp.sum(cells), 0.0),  # rounding
         "mixture_knn_entropy": entropy.knn_entropy(
             sample, config.intrinsic.num_neighbors, labels=rows
         ),

@@ -1,4 +1,4 @@
-"""The weights of the mixture's policies: uniform, geometric, and fully corrective."""
+"""Weights of the mixture's policies: uniform, geometric, last, and fully corrective."""
 
 import jax
 import jax.numpy as jnp
@@ -7,28 +7,32 @@ from scipy import optimize
 
 from maxent_jax.checks import check_number, check_whole
 
-CORRECTIVE_ROUNDS = 1000  # within log(21)/1000 = 0.003 nats for twenty-one policies
+CORRECTIVE_ROUNDS = 1000  # for 21 policies within log(21)/1000 = 0.003 nats of the optimum
 
 
 def uniform_weights(n: int) -> np.ndarray:
-    """[n] float64: 1/n each (MaxEnt-V and LA)."""
+    """Returns [n] float64 weights of 1/n each (MaxEnt-V and LA).
+
+    Raises:
+      ValueError: n < 1.
+    """
     _check_count(n)
     return np.full(n, 1.0 / n)
 
 
 def geometric_weights(n: int, eta: float) -> np.ndarray:
-    """The η-geometric weights of MaxEnt-H, oldest policy first, newest largest.
+    """Returns the η-geometric weights of MaxEnt-H, oldest policy first; the newest is largest.
 
     y_i = (1 - η)^(n - i) for i = 0 ... n - 1, projected on the simplex in the Euclidean norm.
 
     Args:
-      n: policies.
+      n: number of policies.
       eta: step size in (0, 1].
     Returns:
-      [n] float64, at least 0, of sum 1.
+      [n] float64, at least 0, sum 1.
     Raises:
       ValueError: n < 1, or η outside (0, 1].
-    Source: Eq. 13, as in the official code of Hazan et al. 2019; see README, decision 3.
+    Source: Eq. 13, as in the official code of Hazan et al. 2019; see docs/decisions.md, decision 3.
     """
     _check_count(n)
     if not 0 < check_number("eta", eta) <= 1:
@@ -39,19 +43,19 @@ def geometric_weights(n: int, eta: float) -> np.ndarray:
 def fully_corrective_weights(
     occupancies: np.ndarray, smoothing: float, start: np.ndarray | None = None
 ) -> np.ndarray:
-    """The weights whose mixture has the largest smoothed entropy -Σ d(s) log(d(s) + σ).
+    """Returns the weights whose mixture has the largest smoothed entropy -Σ d(s) log(d(s) + σ).
 
-    A concave problem on the simplex, solved by SciPy's SLSQP.
+    This is a concave problem on the simplex, which SciPy's SLSQP solves.
 
     Args:
-      occupancies: [n, S] of each policy, of sum 1.
+      occupancies: [n, S] of each policy over S states, each row of sum 1.
       smoothing: σ > 0.
-      start: [n] weights to begin with; equal ones if left out.
+      start: [n] initial weights; equal ones if None.
     Returns:
-      [n] float64, at least 0, of sum 1.
+      [n] float64, at least 0, sum 1.
     Raises:
-      ValueError: no policies, shapes that do not match, a negative or infinite occupancy, or
-        σ <= 0.
+      ValueError: there are no policies, the shapes do not match, an occupancy is negative or not
+        finite, or σ <= 0.
     """
     occupancies = np.asarray(occupancies, np.float64)
     if occupancies.ndim != 2:
@@ -63,7 +67,7 @@ def fully_corrective_weights(
     if not 0 < check_number("smoothing", smoothing) < np.inf:
         raise ValueError(f"smoothing is {smoothing}, but must be a positive number")
     if start is not None and np.shape(start) != (n,):
-        raise ValueError(f"start has shape {np.shape(start)}, but must be [{n}], one a policy")
+        raise ValueError(f"start has shape {np.shape(start)}, but must be [{n}], one per policy")
 
     def loss(weights):
         mixed = weights @ occupancies
@@ -84,7 +88,7 @@ def fully_corrective_weights(
 
 
 def project_to_simplex(values: np.ndarray) -> np.ndarray:
-    """The nearest point [n] with entries at least 0 of sum 1, in closed form.
+    """Projects `values` [n] on the simplex: the nearest point [n] with entries >= 0 and sum 1.
 
     Source: Duchi et al. 2008, Fig. 1.
     """
@@ -95,16 +99,20 @@ def project_to_simplex(values: np.ndarray) -> np.ndarray:
 
 
 def last_weights(n: int) -> np.ndarray:
-    """[n] float64: the newest policy alone."""
+    """Returns [n] float64 weights: 1 for the newest policy, 0 for the others.
+
+    Raises:
+      ValueError: n < 1.
+    """
     _check_count(n)
     return np.eye(n)[-1]
 
 
 def weight_table(kind: str, capacity: int, eta: float) -> np.ndarray:
-    """[P, P] float32: row n - 1 weighs the first n policies, zero beyond.
+    """Returns [P, P] float32 weights: row n - 1 for a mixture of n policies, 0 in the other slots.
 
-    Made once on the host in float64, so that no projection of dynamic size enters the scan. Fully
-    corrective weights depend on what is visited, and begin from equal ones.
+    It is computed once on the host in float64, so that the scan needs no projection of dynamic
+    size. Fully corrective weights depend on the visited states; they start from equal weights.
     """
     makers = {"geometric": lambda n: geometric_weights(n, eta), "last": last_weights}
     make = makers.get(kind, uniform_weights)
@@ -115,15 +123,17 @@ def weight_table(kind: str, capacity: int, eta: float) -> np.ndarray:
 
 
 def most_entropic_weights(occupancies: jax.Array, weights: jax.Array) -> jax.Array:
-    """Fully corrective weights within a program: the largest entropy of Σ w_i d_i, [P] of sum 1.
+    """Fully corrective weights within a jitted program: those of the largest entropy of Σ w_i d_i.
 
-    Each round multiplies w_i by exp(-Σ d_i log Σ w_j d_j) and normalises: Blahut and Arimoto's
-    algorithm, here for a channel whose inputs are also paid their own entropy, so that the entropy
+    Each round multiplies w_i by exp(-Σ d_i log Σ w_j d_j) and normalises. This is Blahut and
+    Arimoto's algorithm, here for a channel whose inputs also earn their own entropy, so the entropy
     never falls. After n rounds it is within log(1/min w)/n of the largest.
 
     Args:
-      occupancies: [P, S] >= 0, of sum 1 where there is a policy.
-      weights: [P] to begin with, 0 where there is no policy.
+      occupancies: [P, S] >= 0 over S cells, of sum 1 where the slot holds a policy.
+      weights: [P] initial weights, 0 for an empty slot.
+    Returns:
+      [P] of sum 1.
     Source: Arimoto 1972; Blahut 1972.
     """
 

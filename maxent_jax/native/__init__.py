@@ -1,8 +1,8 @@
 """C++ that XLA calls on a CPU: the search for nearest neighbours (knn.cc), physics (physics.cc).
 
-An optional fast path: results are the same without it. The library is built once for each kind of
-processor. Nothing of a build runs where it cannot: a small library for the oldest processors
-(cpu.c) says which one to load. The search can be built for NVIDIA's GPUs too (knn.cu).
+An optional fast path: results are the same without it. There is one build for each kind of
+processor. A small library that runs on the oldest processors (cpu.c) says which build to load, so
+that none runs where it cannot. The search can also be built for NVIDIA GPUs (knn.cu).
 """
 
 import ctypes
@@ -17,7 +17,7 @@ from maxent_jax.errors import ConfigError
 
 TARGETS = ("maxent_knn", "maxent_physics")
 CUDA_TARGET = "maxent_knn_cuda"
-# Builds, the fastest first, and the processors that run each, as maxent_level numbers them.
+# Builds, fastest first, and the processors that run each, by their number from maxent_level.
 LEVELS = {"v4": (4,), "v3": (3, 4), "v8": (8,)}
 NONE, AUTO = "none", "auto"
 CHOICE = "MAXENT_JAX_NATIVE"  # environment variable: a build's name, none, or auto
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 @functools.cache
 def library() -> ctypes.CDLL | None:
-    """The build for this processor, its functions known to XLA; None where there is none.
+    """Loads the build for this processor, and registers its functions with XLA; None without one.
 
     Raises:
       ConfigError: MAXENT_JAX_NATIVE names a build that cannot be used here.
@@ -41,14 +41,14 @@ def library() -> ctypes.CDLL | None:
 
 @functools.cache
 def cuda() -> ctypes.CDLL | None:
-    """The build for NVIDIA's GPUs, its function known to XLA; None where there is none."""
+    """Loads the build for NVIDIA GPUs, and registers its function with XLA; None without one."""
     if not path("cuda").exists():
         return None
     return _load("cuda", (CUDA_TARGET,), "CUDA")
 
 
 def _load(name: str, targets: tuple[str, ...], platform: str) -> ctypes.CDLL:
-    """A build, its functions known to XLA on that platform."""
+    """Loads a build, and registers its functions with XLA for a platform."""
     loaded = ctypes.CDLL(str(path(name)))
     for target in targets:
         function = jax.ffi.pycapsule(getattr(loaded, target))
@@ -58,7 +58,7 @@ def _load(name: str, targets: tuple[str, ...], platform: str) -> ctypes.CDLL:
 
 @functools.cache
 def variant() -> str:
-    """Which build is used: v4 (x86-64 with AVX-512), v3 (with AVX2), v8 (64-bit Arm), or none.
+    """Returns the build in use: v4 (x86-64 with AVX-512), v3 (with AVX2), v8 (64-bit Arm), or none.
 
     Raises:
       ConfigError: MAXENT_JAX_NATIVE names a build that cannot be used here.
@@ -77,12 +77,12 @@ def variant() -> str:
 
 
 def usable() -> tuple[str, ...]:
-    """The builds that were made and that this processor can run, the fastest first."""
+    """Returns the builds that exist and that this processor can run, fastest first."""
     return tuple(name for name in LEVELS if path(name).exists() and _level() in LEVELS[name])
 
 
 def path(name: str) -> Path:
-    """Where the build of that name lies, if it was made."""
+    """Returns the path of a build, whether it exists or not."""
     return FOLDER / f"_{name}.so"
 
 

@@ -1,11 +1,11 @@
-/* Which builds of the library this processor can run. Compiled for the oldest processors of its
-   architecture, so that it can be asked anywhere, before any other build is loaded. */
+/* Tells which builds of the library this processor can run. Compiled for the oldest processors of
+   its architecture, so that it runs anywhere, before any other build is loaded. */
 
-/* The x86-64 level of the build to load: 4 (AVX-512), 3 (AVX2), or 0 where neither can run; 8 on
+/* The x86-64 level of the build to load: 4 (AVX-512), 3 (AVX2), or 0 if neither can run; 8 on
    64-bit Arm. */
 int maxent_level(void) {
 #if defined(__x86_64__)
-  __builtin_cpu_init(); /* also asks whether the system saves the wide registers */
+  __builtin_cpu_init(); /* also checks that the system saves the wide registers */
   if (!(__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
         __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2") &&
         __builtin_cpu_supports("popcnt")))

@@ -1,11 +1,12 @@
 // Exact k-nearest-neighbour distances on a CPU, called from XLA. See knn.py for what they mean.
 //
-// Few queries meet every point: a register of queries stays while the points pass by, and a point
-// that is nearer to one of them than the worst of its k so far, which is rare, is inserted.
-// Many queries descend a tree of bounding boxes: points in leaves of 64, a register of nodes below
-// one.
+// Few queries are compared with every point. A register holds several queries while the loop passes
+// over the points. A point is inserted if it is nearer to a query than the worst of its k so far,
+// which is rare.
+// Many queries descend a tree of bounding boxes. A leaf has 64 points, and each node has a register
+// of children.
 // Both compute a squared distance by the same operations in the same order, and rounding is
-// monotonic, so that a box is never farther than a point within it: the two agree to the bit.
+// monotonic, so that a box is never farther than a point within it: the results are bit-identical.
 
 #include <algorithm>
 #include <cmath>
@@ -31,17 +32,17 @@ using maxent::parallel;
 
 #define INLINE inline __attribute__((always_inline))
 
-// Float32 in a register. AVX2 has 16 registers: with 8 lanes, 7 coordinates of the queries and 4
-// partial sums stay in them, with 16 lanes in two registers each they do not.
+// Float32 values in a register. AVX2 has 16 registers. 7 coordinates of the queries and 4 partial
+// sums fit into them with 8 lanes, but not with 16 lanes in two registers each.
 #ifdef __AVX512F__
 constexpr int kLanes = 16;
 #else
 constexpr int kLanes = 8;
 #endif
-constexpr int kLeaf = 64;        // points, whose registers share one test
+constexpr int kLeaf = 64;        // points; one test covers all their registers
 constexpr int kFanout = kLanes;  // children of a node
-constexpr int kTile = 64;        // queries that one job takes, at most
-constexpr int kChunk = 512;      // points that stay in the first-level cache while a tile passes
+constexpr int kTile = 64;        // most queries in one job
+constexpr int kChunk = 512;      // points that stay in the first-level cache during a tile
 constexpr float kInf = std::numeric_limits<float>::infinity();
 
 using Lanes = float __attribute__((vector_size(kLanes * sizeof(float))));
@@ -54,7 +55,7 @@ INLINE Lanes load(const float* from) {
 }
 
 // The order in which squares are summed: 1, 0, 2, 3, …. XLA's compiler fuses multiplication and
-// addition in that one, and so the results are equal to those without this file.
+// addition in this order, so the results equal those without this file.
 INLINE int64_t nth(int64_t i, int64_t num_features) {
   return num_features > 1 && i < 2 ? 1 - i : i;
 }
@@ -65,7 +66,7 @@ INLINE Lanes smaller(Lanes a, Lanes b) { return a < b ? a : b; }
 
 INLINE Lanes larger(Lanes a, Lanes b) { return a < b ? b : a; }
 
-// The lanes in which `a` is below `b`, a bit each: the one test of the inner loops.
+// One bit for each lane in which `a` is below `b`: the only test of the inner loops.
 INLINE uint32_t below(Lanes a, Lanes b) {
 #if defined(__AVX512F__)
   return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LT_OQ);
@@ -81,7 +82,7 @@ INLINE uint32_t below(Lanes a, Lanes b) {
 
 INLINE Lanes all(float x) { return Lanes{} + x; }
 
-// Into the `k` smallest squares, ascending.
+// Inserts a square into the `k` smallest, which are ascending.
 INLINE void insert(float square, float* smallest, int64_t k) {
   int64_t place = k - 1;
   for (; place > 0 && smallest[place - 1] > square; --place) smallest[place] = smallest[place - 1];
@@ -109,7 +110,7 @@ void finish(const Problem& problem, int64_t query, const float* smallest, int64_
     out[i] = valid ? std::sqrt(smallest[i * stride]) : std::numeric_limits<float>::quiet_NaN();
 }
 
-// Points [from, to) against one register of queries. kFeatures 0: known only at run time.
+// Compares points [from, to) with one register of queries. kFeatures 0: known only at run time.
 template <int kFeatures, int kUnroll>
 INLINE int64_t pass(const Problem& problem, int64_t from, int64_t to, const float* coordinates,
                     const int32_t* exclude, float* smallest) {
@@ -137,7 +138,7 @@ INLINE int64_t pass(const Problem& problem, int64_t from, int64_t to, const floa
     for (int u = 0; u < kUnroll; ++u) {
       if (!below(squares[u], worst)) continue;
       Lanes square = excluded == problem.labels[m + u] ? all(kInf) : squares[u];
-      for (int64_t i = 0; i < k; ++i) {  // what is larger moves on to the next place
+      for (int64_t i = 0; i < k; ++i) {  // the larger one moves to the next place
         const Lanes kept = load(smallest + i * kLanes);
         store(smaller(square, kept), smallest + i * kLanes);
         square = larger(square, kept);
@@ -168,7 +169,7 @@ void pass_chunk(const Problem& problem, int64_t from, int64_t to, const float* c
   }
 }
 
-// Queries [first, first + tile) against every point.
+// Compares queries [first, first + tile) with every point.
 void search_all(const Problem& problem, int64_t first, int64_t tile) {
   const int64_t num = std::min(tile, problem.num_queries - first);
   const int64_t groups = (num + kLanes - 1) / kLanes;
@@ -192,8 +193,8 @@ void search_all(const Problem& problem, int64_t first, int64_t tile) {
     finish(problem, first + i, &smallest[i / kLanes * k * kLanes + i % kLanes], kLanes);
 }
 
-// Level 0 holds the leaves; kFanout neighbours on a level have one parent on the next. All is laid
-// out with points or nodes in the lanes: [groups, F, kLanes].
+// Level 0 holds the leaves; kFanout neighbours on a level have one parent on the next. The lanes
+// hold points or nodes: [groups, F, kLanes].
 struct Tree {
   int64_t num_features = 0;
   std::vector<float> points;     // [groups, F, kLanes]; inf where a leaf is not full
@@ -202,7 +203,7 @@ struct Tree {
   std::vector<std::vector<float>> low, high;  // of each level, [groups, F, kLanes]; empty: low is inf
 };
 
-// Which points lie in which leaf: `order` is permuted until each leaf's are neighbours in it.
+// Assigns points to leaves: permutes `order` until the points of each leaf are consecutive.
 // Splits at powers of two, so that every node of every level is a run of leaves.
 class Splitter {
  public:
@@ -213,7 +214,7 @@ class Splitter {
     int64_t from, to;  // leaves
   };
 
-  // The two halves of a range, split across its widest coordinate.
+  // Splits a range into two halves across its widest coordinate.
   int64_t split(Range range) {
     const int64_t begin = range.from * kLeaf;
     const int64_t end = std::min<int64_t>(range.to * kLeaf, order_.size());
@@ -237,7 +238,7 @@ class Splitter {
 
  private:
   int64_t widest_coordinate(int64_t begin, int64_t end) const {
-    const int64_t step = std::max<int64_t>(1, (end - begin) / 256);  // a sample will do
+    const int64_t step = std::max<int64_t>(1, (end - begin) / 256);  // a sample is enough
     int64_t widest = 0;
     float largest = -1;
     for (int64_t f = 0; f < problem_.num_features; ++f) {
@@ -278,7 +279,7 @@ std::vector<int32_t> leaf_order(ffi::ThreadPool& pool, const Problem& problem) {
   return order;
 }
 
-// The box of `count` boxes or points that lie in the lanes, into one lane of the level above.
+// Writes the box around `count` boxes or points in the lanes to one lane of the level above.
 void enclose(const float* low, const float* high, int64_t count, int64_t num_features,
              float* box_low, float* box_high, int64_t lane) {
   for (int64_t f = 0; f < num_features; ++f)
@@ -370,7 +371,7 @@ INLINE void search_leaf(const Tree& tree, int64_t leaf, const float* query, int3
   }
 }
 
-// The nodes of a group that may hold a nearer point, nearest last.
+// Collects the nodes of a group that may hold a nearer point, nearest last.
 template <int kFeatures>
 INLINE int64_t open_group(const Tree& tree, int32_t level, int64_t group, const float* query,
                           float worst, Visit* visits) {
@@ -439,7 +440,7 @@ void search_tree(const Problem& problem, const Tree& tree, int64_t first, int64_
   descend_tile(problem, tree, first, last, smallest.data(), visits.data());
 }
 
-// Operands may have leading axes; an axis of 1 serves all along it.
+// Offset of an operand with leading axes; an axis of size 1 is broadcast.
 int64_t offset(ffi::AnyBuffer::Dimensions shape, size_t kept, ffi::AnyBuffer::Dimensions leading,
                int64_t index) {
   int64_t size = 1, result = 0;
@@ -477,7 +478,7 @@ ffi::Error knn(ffi::ThreadPool pool, ffi::Buffer<ffi::F32> queries, ffi::Buffer<
     };
   }
   const int64_t num_queries = shape[shape.size() - 2];
-  // Several jobs for each thread, so that none waits long for another.
+  // Several jobs for each thread, so that no thread waits long for another.
   const int64_t share = num_queries * num_searches / (4 * num_threads(pool));
   const int64_t tile = std::clamp<int64_t>(share / kLanes * kLanes, kLanes, kTile);
   const int64_t tiles = (num_queries + tile - 1) / tile;

@@ -1,8 +1,9 @@
 // Exact k-nearest-neighbour distances on an NVIDIA GPU, called from XLA. See knn.py for what they
 // mean, and knn_thread.h for what a thread does.
 //
-// Many queries: each thread keeps four, and each block meets all points. Few queries: the points
-// are parted among blocks, each of which leaves its k smallest squares; a second kernel merges them.
+// Many queries: each thread keeps four, and each block goes through all points. Few queries: the
+// points are divided among blocks. Each block writes its k smallest squares; a second kernel merges
+// them.
 
 #include <cuda_runtime.h>
 
@@ -25,14 +26,14 @@ using maxent::Thread;
 constexpr int kBlocks = 528;
 constexpr int kMaxNeighbors = 8;
 
-// Searches side by side, each as far behind the one before as the strides say; 0 where they share.
+// Several searches. Strides separate the operands of one search from the next; 0 if shared.
 struct Batch {
   Problem first;
   const int32_t* counts;
   int64_t queries_stride, points_stride, labels_stride, exclude_stride, count_stride;
   int64_t num_points;
-  int32_t parts;   // of the points
-  float* squares;  // [searches, parts, B, k], where parts > 1
+  int32_t parts;   // among which the points are divided
+  float* squares;  // [searches, parts, B, k], if parts > 1
   float* found;    // [searches, B, k] distances
 };
 
@@ -79,7 +80,7 @@ __global__ void __launch_bounds__(kThreads) pass_points(Batch batch) {
   }
 }
 
-// A thread for each query.
+// One thread for each query.
 template <int kSlots, int kNeighbors>
 __global__ void merge(Batch batch) {
   const Problem problem = of_search(batch, blockIdx.z);

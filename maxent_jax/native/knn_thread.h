@@ -1,6 +1,6 @@
-// What one thread of a GPU does in the search for nearest neighbours: a few queries stay in its
-// registers while the points pass by, in tiles that the threads of a block load together. Plain
-// C++, so that a CPU can go through the same steps (tests/test_knn.py).
+// What one GPU thread does in the search for nearest neighbours. It keeps a few queries in its
+// registers and compares them with all points, in tiles that the threads of a block load together.
+// Plain C++, so that a CPU can run the same steps (tests/test_knn.py).
 
 #ifndef MAXENT_JAX_NATIVE_KNN_THREAD_H_
 #define MAXENT_JAX_NATIVE_KNN_THREAD_H_
@@ -22,8 +22,8 @@ namespace maxent {
 constexpr int kThreads = 128;  // of a block
 constexpr int kTile = 128;     // points in shared memory at a time
 
-// A point as it lies in a tile: its coordinates, 0 where there are fewer, and its label. Eight
-// slots, two reads of 16 bytes, hold the paper's seven features.
+// A point in a tile: its coordinates, filled up with 0, and its label. Eight slots, which are two
+// reads of 16 bytes, hold the paper's seven features.
 template <int kSlots>
 struct alignas(16) Point {
   float coordinates[kSlots - 1];
@@ -35,13 +35,13 @@ struct Problem {
   const float* points;     // [M, F]
   const int32_t* labels;   // [M]
   const int32_t* exclude;  // [B]
-  int32_t num_filled;      // points, from the first, that count
+  int32_t num_filled;      // the first points, which count
   int32_t num_queries, num_features;
 };
 
 ON_BOTH float infinity() { return std::numeric_limits<float>::infinity(); }
 
-// A point that is not finite, or none at all, is nobody's neighbour: it lies at infinity.
+// A point that is not finite, or does not exist, lies at infinity: it is never a neighbour.
 template <int kSlots>
 ON_BOTH Point<kSlots> load_point(const Problem& problem, int32_t index) {
   Point<kSlots> point;
@@ -64,7 +64,7 @@ struct Thread {
   float smallest[kQueries][kNeighbors];  // squares, ascending
   int32_t exclude[kQueries];
 
-  // Queries first, first + stride, ...; beyond the last it repeats that.
+  // Loads queries first, first + stride, ...; beyond the last query it repeats the last.
   ON_BOTH void load(const Problem& problem, int32_t first, int32_t stride) {
     UNROLLED
     for (int q = 0; q < kQueries; ++q) {
@@ -90,13 +90,13 @@ struct Thread {
         const float difference = coordinates[q][f] - point.coordinates[f];
         square = fmaf(difference, difference, square);
       }
-      // Rare: of the points that pass by, few are among the nearest so far.
+      // Rare: few points are among the nearest so far.
       if (square < smallest[q][kNeighbors - 1] && point.label != exclude[q])
         insert(square, smallest[q]);
     }
   }
 
-  // What is larger moves on to the next place.
+  // The larger one moves to the next place.
   ON_BOTH static void insert(float square, float* ascending) {
     UNROLLED
     for (int i = 0; i < kNeighbors; ++i) {

@@ -1,4 +1,4 @@
-// What the two sources share: a loop over jobs on XLA's threads, and operands with leading axes.
+// Shared by knn.cc and physics.cc: a loop over jobs on XLA's threads.
 
 #ifndef MAXENT_JAX_NATIVE_PARALLEL_H_
 #define MAXENT_JAX_NATIVE_PARALLEL_H_
@@ -18,8 +18,8 @@ inline int64_t num_threads(xla::ffi::ThreadPool& pool) {
   return std::max<int64_t>(1, pool.num_threads());
 }
 
-// Calls job(0), …, job(count - 1), on XLA's threads and this one. A helper that starts late finds
-// nothing to do, so that nobody waits for a thread that is itself waiting.
+// Calls job(0), …, job(count - 1) on XLA's threads and this one. A helper that starts late finds
+// nothing to do, so that no thread waits for one that is itself waiting.
 inline void parallel(xla::ffi::ThreadPool& pool, int64_t count,
                      const std::function<void(int64_t)>& job) {
   struct Shared {

@@ -22,7 +22,7 @@ using maxent::num_threads;
 using maxent::parallel;
 using Floats = ffi::Buffer<ffi::F32>;
 
-// The functions of the MuJoCo that Python has loaded: this library is not linked against one.
+// Functions of the MuJoCo that Python has loaded: this library is not linked against MuJoCo.
 struct Functions {
   decltype(&mj_makeData) make_data;
   decltype(&mj_step) step;
@@ -30,7 +30,7 @@ struct Functions {
   decltype(&mj_rnePostConstraint) rne_post_constraint;
 };
 
-// A field of mjData that is observed beside the state.
+// A field of mjData that is observed in addition to the state.
 struct Field {
   mjtNum* mjData::* values;
   int64_t size;
@@ -59,7 +59,7 @@ class Simulator {
     float *next_qpos, *next_qvel, *next_warmstart, *derived;
   };
 
-  // Rows [from, to). With 0 substeps it looks at a state instead of stepping it.
+  // Steps rows [from, to). With 0 substeps it only evaluates the state.
   void run(const Rows& rows, int64_t from, int64_t to, int64_t num_substeps) {
     mjData* data = take();
     const int64_t nq = model_->nq, nv = model_->nv, nu = model_->nu;
@@ -113,8 +113,8 @@ struct Simulators {
   std::map<std::string, Simulator, std::less<>> by_name;
 };
 
-// Made when first used, so that loading this library runs none of its code; never destroyed, since
-// MuJoCo may be gone by then.
+// Made at first use, so that loading this library runs none of its code; never destroyed, since
+// MuJoCo may be unloaded by then.
 Simulators& simulators() {
   static auto& made = *new Simulators;
   return made;
@@ -139,7 +139,7 @@ ffi::Error step(ffi::ThreadPool pool, Floats qpos, Floats qvel, Floats warmstart
   };
   const auto shape = qpos.dimensions();
   const int64_t count = qpos.element_count() / shape[shape.size() - 1];
-  // Several jobs for each thread: robots that lie on the ground take longer.
+  // Several jobs for each thread, since robots that lie on the ground take longer.
   const int64_t share = std::max<int64_t>(1, count / (8 * num_threads(pool)));
   parallel(pool, (count + share - 1) / share, [&](int64_t job) {
     simulator->run(rows, job * share, std::min(count, (job + 1) * share), num_substeps);
@@ -149,12 +149,12 @@ ffi::Error step(ffi::ThreadPool pool, Floats qpos, Floats qvel, Floats warmstart
 
 }  // namespace
 
-// The MuJoCo whose structures this file was compiled for.
+// The version of MuJoCo whose structures this file was compiled for.
 extern "C" int maxent_mujoco_version() { return mjVERSION_HEADER; }
 
-// Makes a model known by a name, by which programs refer to it, also those that another process
+// Adds a model under a name, by which programs refer to it, also those that another process
 // compiled. The model must outlive all use; `functions` are in the order of Functions. Returns
-// whether every one of the derived fields is known.
+// whether all derived fields are known.
 extern "C" bool maxent_add_model(const char* name, const mjModel* model, const Functions* functions,
                                  const char* const* derived, const int64_t* sizes, int64_t count) {
   std::vector<Field> fields;

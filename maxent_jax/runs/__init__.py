@@ -1,1 +1,1 @@
-"""A run on disk and its life: its files, checkpoints, progress, signals and processes."""
+"""A run on disk and its execution: files, checkpoints, progress, signals and processes."""

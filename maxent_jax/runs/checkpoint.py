@@ -1,8 +1,8 @@
-"""A run at one moment on disk, and back: its whole state, its config, and what it has measured.
+"""Saves and restores a run: its whole state, its config, and what it has measured.
 
-A checkpoint is a folder, named by how far the run has come. It is made under another name and
-renamed once it is complete and sealed, so what bears its name and is not whole is damaged. Archive
-and visits are an item of their own, so that analysis neither loads nor reads the replay.
+A checkpoint is a folder named by the progress of the run. It is written under another name and
+renamed once it is complete and sealed, so a folder with its final name that is incomplete is
+damaged. Archive and visits are a separate item, so analysis neither loads nor reads the replay.
 """
 
 import contextlib
@@ -33,22 +33,22 @@ from maxent_jax.runs.integrity import ARRAYS, FOLDER, UNFINISHED
 from maxent_jax.sac.agent import Parameters
 
 CHECKPOINTS_KEPT = 2
-WITH_MOMENTS = 5  # the schema since which an agent may have moments of its inputs
-# In a checkpoint's folder, beside its config.json and metrics.jsonl:
+WITH_MOMENTS = 5  # from this schema on, an agent can have moments of its inputs
+# In a checkpoint's folder, in addition to config.json and metrics.jsonl:
 PROGRESS, PARTIAL = "progress.json", "partial.npz"
 
 
 class Progress(NamedTuple):
-    """What a run has measured so far, of which its metrics are made."""
+    """What a run has measured so far; its metrics are made from it."""
 
     rows: list[dict[str, Any]]  # one for each complete iteration, as in metrics.jsonl
-    begun: dict[str, np.ndarray] | None  # of the beginning of the next, if it has begun
-    segments: list[dict[str, np.ndarray]]  # of its segments so far
+    begun: dict[str, np.ndarray] | None  # from the beginning of the next iteration, if it has begun
+    segments: list[dict[str, np.ndarray]]  # from each of its segments so far
     clock: dict[str, Any]  # seconds by name
 
     @property
     def name(self) -> str:
-        """Of the checkpoint: 3 after three iterations, 3+7 after seven segments of the next."""
+        """The checkpoint's name: 3 after three iterations, 3+7 after seven segments of the next."""
         return f"{len(self.rows)}" + ("" if self.begun is None else f"+{len(self.segments)}")
 
 
@@ -61,14 +61,14 @@ class Results(NamedTuple):
 
 
 def save(run_directory: Path, state: State, progress: Progress, machine: dict[str, Any]) -> None:
-    """Writes a checkpoint whole or, to all who look, not at all. Older ones go.
+    """Writes a checkpoint atomically, then removes older ones.
 
-    With several processes each calls it, and writes its part of the arrays.
+    With several processes, each calls this function and writes its share of the arrays.
 
     Args:
-      machine: that the state was computed on, beside the versions of its software.
+      machine: what the state was computed on, in addition to the versions of the software.
     Raises:
-      SaveError: it cannot be written; those before are intact.
+      SaveError: the checkpoint cannot be written; earlier ones are intact.
     """
     folder = run_directory / FOLDER
     temporary = (folder / f"{UNFINISHED}{progress.name}").absolute()
@@ -88,16 +88,16 @@ def save(run_directory: Path, state: State, progress: Progress, machine: dict[st
             temporary.rename(folder / progress.name)
             for old in integrity.checkpoints(run_directory)[:-CHECKPOINTS_KEPT]:
                 shutil.rmtree(folder / old)
-    except (OSError, ValueError, SaveError) as error:  # tensorstore's are ValueErrors
+    except (OSError, ValueError, SaveError) as error:  # TensorStore raises ValueErrors
         shutil.rmtree(temporary, ignore_errors=True)
         raise SaveError(
             f"cannot save checkpoint {progress.name} of {run_directory}: {_reason(error)}; "
-            f"those before it are intact."
+            f"earlier checkpoints are intact."
         ) from error
 
 
 def read_progress(run_directory: Path, name: str) -> tuple[Progress, dict[str, Any]]:
-    """What that checkpoint's run had measured, and what it was computed with."""
+    """Returns what the run had measured at a checkpoint, and what it was computed with."""
     folder = run_directory / FOLDER / name
     content = json.loads((folder / PROGRESS).read_text(encoding="utf-8"))
     begun, segments = None, []
@@ -111,12 +111,12 @@ def read_progress(run_directory: Path, name: str) -> tuple[Progress, dict[str, A
 
 
 def restore(run_directory: Path, name: str, config: Config, placed: State | None = None) -> State:
-    """The state of that checkpoint, on whatever devices it was saved from.
+    """Restores the state of a checkpoint, whatever devices it was saved from.
 
     Args:
       placed: the sharding of each leaf, see devices.placement; one device if left out.
     Raises:
-      CheckpointError: it does not hold a state of this config.
+      CheckpointError: the checkpoint does not hold a state of this config.
     """
     shapes = _shapes(config)
     items = _load(run_directory, name, _items(_abstract(shapes, placed)))
@@ -126,10 +126,10 @@ def restore(run_directory: Path, name: str, config: Config, placed: State | None
 
 
 def restore_results(run_directory: Path, name: str, config: Config) -> Results:
-    """The archive and visits of that checkpoint, without the replay.
+    """Restores the archive and visits of a checkpoint, without the replay.
 
     Raises:
-      CheckpointError: it does not hold results of this config.
+      CheckpointError: the checkpoint does not hold results of this config.
     """
     results: Results = _items(_abstract(_shapes(config)))["results"]
     if files.read_schema(run_directory) >= WITH_MOMENTS:
@@ -159,7 +159,7 @@ def _write_progress(folder: Path, progress: Progress, machine: dict[str, Any]) -
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Orbax's threads print whole tracebacks of what it raises as well."""
+    """Silences Orbax's threads, which print tracebacks of errors that Orbax also raises."""
     logger = logging.getLogger("absl")
     level = logger.level
     logger.setLevel(logging.CRITICAL)
@@ -170,7 +170,7 @@ def _silence() -> Iterator[None]:
 
 
 def _reason(error: Exception) -> str:
-    """In the system's words where they are known; TensorStore gives their number."""
+    """The system's message where there is one; TensorStore gives only its number."""
     code = re.search(r"os_error_code='(\d+)'", str(error))
     if code:
         return os.strerror(int(code[1]))
@@ -193,7 +193,7 @@ def _items(state: State) -> dict[str, Any]:
 
 
 def _stored(state: State) -> State:
-    """What Orbax is given: it has no place for an array without elements, nor our kind of keys."""
+    """What Orbax stores: it accepts neither arrays without elements nor typed keys."""
 
     def of_leaf(x: Any) -> Any:
         if math.prod(x.shape) == 0:
@@ -204,7 +204,7 @@ def _stored(state: State) -> State:
 
 
 def _as_computed(stored: State, shapes: State, placed: State | None) -> State:
-    """The state again, of which `_stored` gave only a part."""
+    """Rebuilds the state from what `_stored` gave."""
     leaves, tree = jax.tree.flatten(shapes)
     shardings = [None] * len(leaves) if placed is None else jax.tree.leaves(placed)
     kept = iter(jax.tree.leaves(stored))
@@ -231,11 +231,11 @@ def _shapes(config: Config) -> State:
 
 
 def _abstract(shapes: State, placed: State | None = None) -> State:
-    """What Orbax is to load, and where each array is to lie."""
+    """What Orbax must load, and on which devices."""
     if placed is None:
         device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
         placed = jax.tree.map(lambda _: device, shapes)
-    # As `_stored`: its functions compute, and a shape has no values.
+    # `_stored` for shapes: its own functions compute, and a shape has no values.
     data = jax.eval_shape(
         lambda state: jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, state),
         shapes,
@@ -255,19 +255,19 @@ def _load(run_directory: Path, name: str, abstract: dict[str, Any]) -> dict[str,
     path = (run_directory / FOLDER / name / ARRAYS).absolute()
     saved = ocp.checkpointables_metadata(path).metadata
     for item, expected in abstract.items():
-        # Orbax itself would turn another dtype into the one expected, and say nothing.
+        # Orbax itself would silently convert another dtype to the expected one.
         wrong = _arrays(saved[item]) ^ _arrays(expected)
         if wrong:
             array, shape, dtype = min(wrong)
             raise CheckpointError(
-                f"checkpoint {name} of {run_directory} does not fit its config: see {array}, "
+                f"checkpoint {name} of {run_directory} does not match its config: see {array}, "
                 f"{dtype} of shape {shape}."
             )
     return ocp.load_checkpointables(path, abstract)
 
 
 def _arrays(tree: Any) -> set[tuple[str, tuple[int, ...], str]]:
-    """The name, shape and dtype of each."""
+    """The name, shape and dtype of each array."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     keystr = functools.partial(jax.tree_util.keystr, simple=True, separator=".")
     return {(keystr(path), tuple(x.shape), str(x.dtype)) for path, x in leaves if x is not None}

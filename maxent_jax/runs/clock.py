@@ -1,4 +1,4 @@
-"""Seconds spent on a run, through all interruptions."""
+"""Measures the seconds spent on a run, across interruptions."""
 
 import time
 from typing import Any
@@ -7,10 +7,10 @@ import jax
 
 
 class Clock:
-    """Times the parts of an iteration; begins where the run's last checkpoint left it."""
+    """Times the portions of an iteration; continues from the run's last checkpoint."""
 
     def __init__(self, process_started: float, seconds: dict[str, Any]):
-        """Of a process that began at that time.perf_counter(); `seconds` as it was saved."""
+        """Takes the time.perf_counter() at which the process began, and the saved `seconds`."""
         self._process_started = process_started
         self._origin = process_started - seconds.get("wall_seconds", 0.0)
         self._first_step: float | None = seconds.get("wall_first_step")
@@ -19,7 +19,7 @@ class Clock:
         self._parts: dict[str, float] = dict(seconds.get("parts", {}))
 
     def time(self, part: str, function, *arguments):
-        """What the function returns, with metrics as numpy arrays."""
+        """Calls and times a function; returns its state, and its metrics as numpy arrays."""
         started = time.perf_counter()
         result = jax.block_until_ready(function(*arguments))
         seconds = time.perf_counter() - started
@@ -32,33 +32,33 @@ class Clock:
         return state, jax.device_get(metrics)
 
     def compiled(self, started: float) -> None:
-        """Counts the time since then as spent on compilation."""
+        """Counts the time since `started` as compilation."""
         self._compile += time.perf_counter() - started
 
     def saved(self, started: float) -> None:
-        """Counts the time since then as spent on a checkpoint."""
+        """Counts the time since `started` as saving a checkpoint."""
         seconds = time.perf_counter() - started
         self._parts["wall_save"] = self._parts.get("wall_save", 0.0) + seconds
 
     def end_iteration(self) -> dict[str, float | None]:
-        """The columns of the iteration just ended; the parts start again at 0."""
+        """Returns the columns of the iteration just ended; the portions restart at 0."""
         parts, self._parts = self._parts, {}
         return self._totals() | {"wall_peak_bytes": _peak_bytes(), "wall_save": 0.0} | parts
 
     def seconds(self) -> dict[str, Any]:
-        """All that a later process needs to go on."""
+        """Returns all that a later process needs to continue."""
         return self._totals() | {"parts": self._parts}
 
     def _totals(self) -> dict[str, float | None]:
         return {
             "wall_seconds": time.perf_counter() - self._origin,
-            "wall_compile": self._compile,  # of all processes that carried the run
+            "wall_compile": self._compile,  # of all processes that trained the run
             "wall_first_step": self._first_step,  # to the end of the first segment
             "wall_train_total": self._train_total,
         }
 
 
 def _peak_bytes() -> int | None:
-    """Of the first device's memory, where it keeps count: a GPU or a TPU."""
+    """Peak memory of the first device, if it counts it (a GPU or a TPU)."""
     statistics = jax.local_devices()[0].memory_stats() or {}
     return statistics.get("peak_bytes_in_use")

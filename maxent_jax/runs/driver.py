@@ -23,12 +23,12 @@ from maxent_jax.runs.stages import Stage, advance, check_finite
 
 
 class Options(NamedTuple):
-    """How a run is carried out; nothing of it changes a result."""
+    """How a run is executed; no option changes a result."""
 
-    num_devices: int = 1  # that share the run; 0: all
-    fallback: bool = False  # from the checkpoint before, where the latest is damaged
-    save_iterations: int = 1  # between checkpoints
-    save_minutes: float = 10.0  # after which an iteration is saved between two segments
+    num_devices: int = 1  # devices that share the run; 0: all
+    fallback: bool = False  # if the latest checkpoint is damaged, use the one before
+    save_iterations: int = 1  # iterations between checkpoints
+    save_minutes: float = 10.0  # without a checkpoint, then save between segments
     sinks: Sinks = Sinks()
 
 
@@ -36,10 +36,10 @@ AS_USUAL = Options()
 
 
 def check(config: Config, options: Options = AS_USUAL) -> None:
-    """Refuses what cannot run here, before anything is compiled or written.
+    """Rejects a run that is impossible here, before anything is compiled or written.
 
     Raises:
-      UsageError, ConfigError: no such device, no such share of devices, or too little memory.
+      UsageError, ConfigError: a device is missing, or the memory is too small.
     """
     runtime.check_devices()
     memory.check(config, _chosen(options.num_devices))
@@ -48,17 +48,17 @@ def check(config: Config, options: Options = AS_USUAL) -> None:
 def train(
     config: Config, directory: Path, process_started: float, options: Options = AS_USUAL
 ) -> None:
-    """Trains to the end, from the last checkpoint if there is one.
+    """Trains a run to its end, from its last checkpoint if there is one.
 
     Args:
-      directory: exists; empty, or with this very run in it.
+      directory: an existing directory, empty or with this run in it.
       process_started: time.perf_counter() when the program began, for the time to the first step.
     Raises:
       UsageError, ConfigError: see `check`.
       CheckpointCorruptError: the last checkpoint is damaged.
-      SaveError: something cannot be written.
-      NonFiniteError: training left the finite numbers.
-      Interrupted: a signal came, and the run is saved.
+      SaveError: a file cannot be written.
+      NonFiniteError: training produced a number that is not finite.
+      Interrupted: a signal arrived, and the run is saved.
     """
     runtime.prepare(config.simulates_in_jax)
     check(config, options)
@@ -84,15 +84,15 @@ def train(
 
 
 def _chosen(num_devices: int) -> list[jax.Device]:
-    """That many devices, 0 for all."""
+    """The first `num_devices` devices; 0: all."""
     available = jax.devices()
     if num_devices > len(available):
-        raise UsageError(f"devices is {num_devices}, but there are {len(available)}.")
+        raise UsageError(f"devices is {num_devices}, but only {len(available)} are available.")
     return available[: num_devices or None]
 
 
 def _placement(config: Config, num_devices: int) -> State | None:
-    """Of the state on that many devices, 0 for all; None for one."""
+    """Placement of the state on `num_devices` devices (0: all); None for one device."""
     chosen = _chosen(num_devices)
     if len(chosen) == 1:
         return None
@@ -116,7 +116,7 @@ def _method_in_words(config: Config) -> dict[str, Any]:
 
 
 def _last_progress(directory: Path, options: Options) -> Progress | None:
-    """Of the checkpoint that the run goes on from, None without one. The metrics become its."""
+    """Progress of the checkpoint to continue from, if any; resets the metrics to it."""
     if not integrity.checkpoints(directory):
         return None
     name, passed_over = integrity.find(directory, fallback=options.fallback)
@@ -125,14 +125,12 @@ def _last_progress(directory: Path, options: Options) -> Progress | None:
     def go_back_to_it() -> None:
         for damaged, sentence in passed_over.items():
             shutil.rmtree(directory / integrity.FOLDER / damaged)
-            say(
-                f"note: {sentence[:-1]}; it is removed, and the run goes on from checkpoint {name}."
-            )
+            say(f"note: {sentence[:-1]}; it is removed, the run continues from checkpoint {name}.")
         for what, now in (files.stack() | _machine()).items():
             if computed_with.get(what) != now:
                 say(
-                    f"note: {what} was {computed_with.get(what)} and is {now}: from here on the "
-                    f"run may not be bit-identical to an undisturbed one."
+                    f"note: {what} was {computed_with.get(what)} and is now {now}: from here on, "
+                    f"the run may not be bit-identical to an uninterrupted one."
                 )
         files.write_metrics(directory, progress.rows)
 
@@ -141,7 +139,7 @@ def _last_progress(directory: Path, options: Options) -> Progress | None:
 
 
 def _machine() -> dict[str, Any]:
-    """What the bits of a result depend on beside the software, the kind of processor included."""
+    """What bit-identical results depend on in addition to the software, such as the processor."""
     return {
         "device": jax.devices()[0].device_kind,
         "devices": jax.device_count(),
@@ -158,7 +156,7 @@ def _train(
     process_started: float,
     options: Options,
 ) -> list[dict[str, Any]]:
-    """The iterations that are left; the rows of all."""
+    """Trains the remaining iterations; returns the rows of all iterations."""
     state, progress = stage
     done = len(progress.rows)
     clock = Clock(process_started, progress.clock)
@@ -202,6 +200,6 @@ def _summarise(config: Config, directory: Path, rows: list[dict[str, Any]]) -> N
         random = f" (a random policy: {np.mean(last['random_coverage']):,.0f})"
     print(
         f"{directory}: training visited {np.mean(last['cumulative_coverage']):,.0f} of {cells:,} "
-        f"cells{random}, the mixture of {config.archive_size} policies "
-        f"{np.mean(last['mixture_coverage']):,.0f}; {duration(last['wall_seconds'])}."
+        f"cells{random}; the mixture of {config.archive_size} policies "
+        f"visits {np.mean(last['mixture_coverage']):,.0f} cells; {duration(last['wall_seconds'])}."
     )

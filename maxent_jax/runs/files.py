@@ -1,4 +1,4 @@
-"""A run's directory: its config, its metrics, and where the rest lies. Loads no array library."""
+"""Reads and writes the config and metrics in a run's directory. Loads no array library."""
 
 import contextlib
 import dataclasses
@@ -15,12 +15,12 @@ from typing import Any
 from maxent_jax.config import DEFAULTS, Config, from_flat, registry
 from maxent_jax.errors import ConfigError, RunError, SaveError
 
-SCHEMA = 7  # of the directory, checkpoints included
-READABLE = (4, 5, 6, 7)  # whose policies and visits have the same arrays
-RESUMABLE = (6, 7)  # whose whole state has the same arrays
-REMOVED = {"restart_actor": False}  # settings of older schemas, with the value that is ours
+SCHEMA = 7  # of the directory, including its checkpoints
+READABLE = (4, 5, 6, 7)  # schemas with the same arrays for policies and visits
+RESUMABLE = (6, 7)  # schemas with the same arrays for the whole state
+REMOVED = {"restart_actor": False}  # settings of older schemas, with the value now fixed
 CONFIG, METRICS, FIGURES = "config.json", "metrics.jsonl", "figures"
-# All that any entry point writes there.
+# All that any command writes there.
 WRITTEN = (
     *(CONFIG, METRICS, FIGURES, "checkpoints", "evaluation.json"),
     *("videos", "report.html", "tensorboard", "wandb"),
@@ -29,7 +29,7 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "o
 
 
 def stack() -> dict[str, str]:
-    """The versions that a run's bits depend on."""
+    """Returns the software versions on which bit-identical results depend."""
     versions = {name: importlib.metadata.version(name) for name in PACKAGES}
     return {"python": platform.python_version()} | versions
 
@@ -37,7 +37,7 @@ def stack() -> dict[str, str]:
 def write_config(
     directory: Path, config: Config, method: dict[str, Any], machine: dict[str, Any]
 ) -> None:
-    """config.json: every setting, what departs from the paper, the stack and the machine."""
+    """Writes config.json: settings, departures from the paper, software versions and machine."""
     departures = {
         name: {"value": config[name], "why": why} for name, why in config.deviations().items()
     }
@@ -62,10 +62,10 @@ def write_config(
 
 
 def read_config(directory: Path) -> Config:
-    """The config of a run.
+    """Reads the config of a run.
 
     Raises:
-      RunError: no run there, or one of another schema.
+      RunError: the directory holds no run, or a run of another schema.
     """
     path = directory / CONFIG
     try:
@@ -82,11 +82,11 @@ def read_config(directory: Path) -> Config:
     try:
         return from_flat(_ungrouped(settings))
     except (TypeError, ConfigError) as error:
-        raise RunError(f"{path} does not fit this release: {error}") from None
+        raise RunError(f"{path} does not match this release: {error}") from None
 
 
 def _ungrouped(settings: dict[str, Any]) -> dict[str, Any]:
-    """Every setting by its name; schemas before 7 had no groups."""
+    """Returns every setting by name; schemas before 7 had no groups."""
     flat: dict[str, Any] = {}
     for name, value in settings.items():
         flat |= value if isinstance(value, dict) else {name: value}
@@ -94,10 +94,10 @@ def _ungrouped(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_resumable(directory: Path) -> None:
-    """Whether this release can go on with the training of the run.
+    """Checks that this release can resume the run.
 
     Raises:
-      RunError: an older release made it, whose replay is stored otherwise.
+      RunError: an older release, which stores the replay differently, made the run.
     """
     schema = read_schema(directory)
     if schema not in RESUMABLE:
@@ -108,7 +108,7 @@ def check_resumable(directory: Path) -> None:
 
 
 def is_config(path: Path) -> bool:
-    """Whether a run may have written that file: any schema, or empty because the machine failed."""
+    """Whether a run can have written this file: of any schema, or empty after a crash."""
     try:
         text = path.read_text(encoding="utf-8")
         return not text or {"schema", "config"} <= json.loads(text).keys()
@@ -117,13 +117,13 @@ def is_config(path: Path) -> bool:
 
 
 def check_config(directory: Path, config: Config) -> None:
-    """Whether the run there has these settings, by whatever preset.
+    """Checks that the run has these settings; the name of the preset may differ.
 
     Raises:
-      RunError: it has not, or there is none.
+      RunError: a setting differs, or the directory holds no run.
     """
     saved = read_config(directory)
-    # A preset is a name for values that are compared one by one.
+    # A preset only names values, which are compared one by one.
     values = ((name, saved[name], config[name]) for name in DEFAULTS if name != "preset")
     changed = [f"{name} was {old} and is {new}" for name, old, new in values if old != new]
     if changed:
@@ -131,17 +131,17 @@ def check_config(directory: Path, config: Config) -> None:
 
 
 def read_schema(directory: Path) -> int:
-    """Of a run's directory."""
+    """Returns the schema of a run's directory."""
     return _read(directory)["schema"]
 
 
 def read_versions(directory: Path) -> dict[str, str]:
-    """Of the stack that began the run."""
+    """Returns the software versions with which the run began."""
     return _read(directory)["versions"]
 
 
 def read_id(directory: Path) -> str:
-    """Of the run, drawn when it began."""
+    """Returns the id of the run, drawn when it began."""
     return _read(directory)["id"]
 
 
@@ -150,10 +150,10 @@ def _read(directory: Path) -> dict[str, Any]:
 
 
 def append_metrics(directory: Path, row: dict[str, Any]) -> None:
-    """One line of metrics.jsonl, on disk when this returns.
+    """Appends one line to metrics.jsonl; it is on disk when this function returns.
 
     Raises:
-      SaveError: it cannot be written; an unfinished line is left out by all who read.
+      SaveError: the line cannot be written; readers skip an unfinished line.
     """
     path = directory / METRICS
     with writing(path), open(path, "a", encoding="utf-8") as file:
@@ -163,7 +163,11 @@ def append_metrics(directory: Path, row: dict[str, Any]) -> None:
 
 
 def read_metrics(directory: Path) -> list[dict[str, Any]]:
-    """The rows of metrics.jsonl; an unfinished last line is left out."""
+    """Reads the rows of metrics.jsonl; skips an unfinished last line.
+
+    Raises:
+      RunError: a line is not JSON.
+    """
     path = directory / METRICS
     lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
     try:
@@ -173,19 +177,19 @@ def read_metrics(directory: Path) -> list[dict[str, Any]]:
 
 
 def write_metrics(directory: Path, rows: list[dict[str, Any]]) -> None:
-    """metrics.jsonl with these rows and no others; where it has them, it is left as it is."""
+    """Writes metrics.jsonl with exactly these rows, unless it has them already."""
     path, text = directory / METRICS, _lines(rows)
     if not path.exists() or path.read_text(encoding="utf-8") != text:
         _replace(path, text)
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """A JSON file, whole or not at all. What is not finite becomes null."""
+    """Writes a JSON file atomically; numbers that are not finite become null."""
     _replace(path, json.dumps(jsonable(content), indent=2) + "\n")
 
 
 def jsonable(value: Any) -> Any:
-    """The value in JSON's types. What is not finite becomes null."""
+    """Returns the value in JSON's types; numbers that are not finite become null."""
     if isinstance(value, dict):
         return {key: jsonable(item) for key, item in value.items()}
     if hasattr(value, "tolist"):
@@ -198,21 +202,21 @@ def jsonable(value: Any) -> Any:
 
 
 def check_writable(directory: Path) -> None:
-    """Whether a command can leave its results there.
+    """Checks that a command can write its results there.
 
     Raises:
-      RunError: it cannot.
+      RunError: the directory is not writable.
     """
     if not os.access(directory, os.W_OK | os.X_OK):
-        raise RunError(f"{directory} cannot be written to: make it writable, or copy it elsewhere.")
+        raise RunError(f"{directory} is not writable: make it writable, or copy it elsewhere.")
 
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turns a full disk or a missing permission into one sentence.
+    """Context manager: turns a full disk or a missing permission into one sentence.
 
     Raises:
-      SaveError: what is done inside met an OSError.
+      SaveError: an OSError occurred inside.
     """
     try:
         yield
@@ -224,10 +228,10 @@ def writing(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """A temporary file to write to, which takes the path's place once all went well.
+    """Context manager: gives a temporary file, which replaces `path` if nothing fails.
 
     Raises:
-      SaveError: it cannot be written.
+      SaveError: the file cannot be written.
     """
     temporary = temporary_of(path)
     with writing(path):
@@ -240,7 +244,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def temporary_of(path: Path) -> Path:
-    """The file that `whole_file` writes to before it takes the path's place."""
+    """Returns the temporary file that `whole_file` gives for this path."""
     return path.with_suffix(f".tmp{path.suffix}")
 
 

@@ -1,7 +1,7 @@
-"""Which checkpoints does a run have, and is every file of them what was written?
+"""Finds a run's checkpoints, and checks that every file of them is what was written.
 
-A checkpoint is sealed by a manifest of SHA-256 sums, which `sha256sum -c` reads too. Loads no array
-library.
+A checkpoint is sealed by a manifest of SHA-256 sums, which `sha256sum -c` can also read. Loads no
+array library.
 """
 
 import hashlib
@@ -16,20 +16,20 @@ from maxent_jax.runs import files
 
 FOLDER, UNFINISHED = "checkpoints", "unfinished-"
 ARRAYS = "arrays"
-REPLAY = f"{ARRAYS}/rest/"  # with all else that analysis does without
+REPLAY = f"{ARRAYS}/rest/"  # and everything else that analysis does not need
 MANIFEST = "manifest.sha256"
 _NAME = re.compile(r"(\d+)(?:\+(\d+))?")
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 
 
 def checkpoints(run_directory: Path) -> list[str]:
-    """Their names, from the oldest to the latest."""
+    """Returns the names of the checkpoints, from the oldest to the latest."""
     found = [_NAME.fullmatch(path.name) for path in (run_directory / FOLDER).glob("*")]
     return [m[0] for m in sorted((m for m in found if m), key=_how_far)]
 
 
 def clear_unfinished(run_directory: Path) -> None:
-    """Removes what a killed process left of a checkpoint."""
+    """Removes the unfinished checkpoint of a killed process."""
     for path in (run_directory / FOLDER).glob(f"{UNFINISHED}*"):
         shutil.rmtree(path)
 
@@ -37,45 +37,45 @@ def clear_unfinished(run_directory: Path) -> None:
 def find(
     run_directory: Path, whole: bool = True, fallback: bool = False
 ) -> tuple[str, dict[str, str]]:
-    """The latest checkpoint, each file compared with its checksum.
+    """Finds the latest checkpoint, and compares each of its files with its checksum.
 
     Args:
-      whole: with the replay; else that is not looked at.
-      fallback: pass over damaged ones.
+      whole: include the replay, which is otherwise not read.
+      fallback: skip damaged checkpoints.
     Returns:
-      Its name, and by name a sentence on each that was passed over.
+      Its name, and by name a sentence on each checkpoint that was skipped.
     Raises:
-      CheckpointError: there is none.
-      CheckpointCorruptError: it is damaged or, with fallback, all are; it names the file.
+      CheckpointError: the run has no checkpoint.
+      CheckpointCorruptError: it is damaged or, with fallback, all are; the message names the file.
     """
     passed_over: dict[str, str] = {}
     for name in reversed(checkpoints(run_directory)):
         damage = next(damages(run_directory, name, whole), None)
         if damage is None:
             return name, passed_over
-        if not (run_directory / FOLDER / name).exists():  # its run has gone on, and removed it
+        if not (run_directory / FOLDER / name).exists():  # its run has continued, and removed it
             return find(run_directory, whole, fallback)
         sentence = f"checkpoint {name} of {run_directory} is damaged: {damage}"
         if not fallback:
-            raise CheckpointCorruptError(f"{sentence}; --fallback takes the one before.")
+            raise CheckpointCorruptError(f"{sentence}; --fallback uses the one before.")
         passed_over[name] = f"{sentence}."
     if passed_over:
-        raise CheckpointCorruptError(f"{sentence}, and none before it is intact.")
+        raise CheckpointCorruptError(f"{sentence}, and no earlier one is intact.")
     check_any(run_directory)
-    return find(run_directory, whole, fallback)  # one that was saved meanwhile
+    return find(run_directory, whole, fallback)  # one was saved meanwhile
 
 
 def check_any(run_directory: Path) -> None:
-    """Raises CheckpointError where the run has no checkpoint."""
+    """Raises CheckpointError if the run has no checkpoint."""
     if not checkpoints(run_directory):
         raise CheckpointError(
-            f"{run_directory} holds no complete checkpoint: its run has not saved one yet; train "
-            f"it, with --resume if it is not running."
+            f"{run_directory} holds no complete checkpoint: wait until its run saves one, or "
+            f"train it with --resume if it is not running."
         )
 
 
 def damages(run_directory: Path, name: str, whole: bool = True) -> Iterator[str]:
-    """What is wrong with that checkpoint, a phrase each that begins with a file's name."""
+    """Yields what is wrong with a checkpoint: phrases that begin with a file's name."""
     folder = run_directory / FOLDER / name
     if folder.is_symlink() or folder.parent.is_symlink():
         yield f"{FOLDER}/{name} is a link"
@@ -83,11 +83,11 @@ def damages(run_directory: Path, name: str, whole: bool = True) -> Iterator[str]
     yield from _damages(folder, () if whole else (REPLAY,))
     copy, original = folder / files.CONFIG, run_directory / files.CONFIG
     if copy.is_file() and original.is_file() and copy.read_bytes() != original.read_bytes():
-        yield f"{files.CONFIG} of the run is not the one that it was saved with"
+        yield f"{files.CONFIG} of the run is not the one in the checkpoint"
 
 
 def seal(folder: Path) -> None:
-    """Writes the manifest of all that lies in the folder, once each file of it is on the disk."""
+    """Writes the manifest of all files in the folder, once each of them is on the disk."""
     names = sorted(_names(folder))
     sums = "".join(f"{checksum(folder / name, to_disk=True)}  {name}\n" for name in names)
     manifest = folder / MANIFEST
@@ -96,7 +96,7 @@ def seal(folder: Path) -> None:
 
 
 def checksum(path: Path, to_disk: bool = False) -> str:
-    """SHA-256 of a file, of which the system is told first to write it to the disk, if asked."""
+    """Returns the SHA-256 of a file; with `to_disk`, forces the file to the disk first."""
     with open(path, "rb") as file:
         if to_disk:
             os.fsync(file.fileno())
@@ -104,7 +104,7 @@ def checksum(path: Path, to_disk: bool = False) -> str:
 
 
 def checksum_of(text: str) -> str:
-    """SHA-256 of a text in UTF-8."""
+    """Returns the SHA-256 of a text in UTF-8."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -127,7 +127,7 @@ def _damages(folder: Path, unread: tuple[str, ...]) -> Iterator[str]:
 
 
 def _names(folder: Path) -> Iterator[str]:
-    """Of all that is not a folder, relative to this one; links are not followed."""
+    """Names of all files in the folder, relative to it; links are not followed."""
     for place, folders, plain in os.walk(folder):
         links = [name for name in folders if Path(place, name).is_symlink()]
         for name in plain + links:
@@ -147,7 +147,7 @@ def _read(manifest: Path) -> dict[str, str] | str:
         return "is not what was written"
     expected = {match[2]: match[1] for match in matches if match}
     if any(Path(name).is_absolute() or ".." in Path(name).parts for name in expected):
-        return "names a file outside of its folder"
+        return "names a file outside its folder"
     return expected
 
 

@@ -1,4 +1,4 @@
-"""One process at a time in a directory. The system frees the lock of a process that died."""
+"""Admits one process at a time to a directory. The system frees the lock of a dead process."""
 
 import contextlib
 from collections.abc import Iterator
@@ -13,25 +13,25 @@ LOCK = "lock"
 
 
 class BusyError(UsageError):
-    """Another process is in the directory."""
+    """Another process holds the directory's lock."""
 
 
 @contextlib.contextmanager
 def holding(directory: Path, wait: bool = True) -> Iterator[None]:
-    """Makes a directory, and keeps other processes out of it while inside.
+    """Context manager: makes a directory and locks it against other processes.
 
     Args:
-      wait: for a process that is inside.
+      wait: wait for another process that holds the lock.
     Raises:
-      BusyError: another is inside, and is not waited for.
-      UsageError: it cannot be written.
+      BusyError: another process holds the lock, and `wait` is false.
+      UsageError: the directory cannot be written.
     """
     lock = filelock.FileLock(directory / LOCK, timeout=-1 if wait else 0)
     try:
         directory.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except filelock.Timeout:
-        raise BusyError(f"another process is training in {directory}.") from None
+        raise BusyError(f"another process is training in {directory}: wait for its end.") from None
     except OSError as error:
         raise UsageError(f"cannot write to {directory}: {error.strerror}.") from None
     try:
@@ -41,8 +41,6 @@ def holding(directory: Path, wait: bool = True) -> Iterator[None]:
 
 
 def is_free(directory: Path, first: str) -> bool:
-    """Whether a directory holds nothing but its lock and what a killed process left of the file of
-    that name, the first that is written.
-    """
+    """Whether a directory holds only its lock and an unfinished `first`, the first file written."""
     begun = (LOCK, files.temporary_of(directory / first).name)
     return all(path.name in begun for path in directory.iterdir())

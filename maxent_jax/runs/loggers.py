@@ -1,4 +1,4 @@
-"""Where metrics go beside metrics.jsonl: TensorBoard's files, Weights & Biases. Both are extras."""
+"""Sends metrics to TensorBoard and Weights & Biases too; both need the extra `log`."""
 
 import contextlib
 import dataclasses
@@ -20,13 +20,13 @@ Sink = Callable[[Row], None]
 
 
 class Sinks(NamedTuple):
-    """Which are asked for."""
+    """Where to send metrics, in addition to metrics.jsonl."""
 
     tensorboard: bool = False
     wandb: str = ""  # its project; "" for none
 
     def check(self) -> None:
-        """Raises UsageError where the package of one is missing."""
+        """Raises UsageError if the package for one of them is missing."""
         for flag, asked, package in (
             ("tensorboard", self.tensorboard, "tensorboardX"),
             ("wandb", bool(self.wandb), "wandb"),
@@ -39,7 +39,7 @@ class Sinks(NamedTuple):
 
     @contextlib.contextmanager
     def open(self, directory: Path, config: Config, iteration: int) -> Iterator[Sink]:
-        """A function that passes on the row of each iteration after that one."""
+        """Context manager: gives a function that sends the row of each iteration after that one."""
         with contextlib.ExitStack() as opened:
             sinks: list[Callable[[int, Scalars], Any]] = []
             if self.tensorboard:
@@ -56,7 +56,7 @@ class Sinks(NamedTuple):
 
 
 def scalars(row: Row) -> Scalars:
-    """The finite numbers of a row by name; name/0, name/1 ... where a column has several."""
+    """Returns the finite numbers of a row by name; name/0, name/1 ... if a column has several."""
     values: Scalars = {}
     for name, value in row.items():
         flat = np.asarray(value, float).ravel()  # None becomes nan
@@ -74,7 +74,7 @@ def _tensorboard(directory: Path, iteration: int) -> Iterator[Callable[[int, Sca
             writer.add_scalar(name, value, iteration)
         writer.flush()
 
-    # Of rows that a resumed run makes again, the earlier are not shown.
+    # A resumed run repeats some rows; only the later ones are shown.
     with SummaryWriter(str(directory / "tensorboard"), purge_step=iteration + 1) as writer:
         yield write
 

@@ -1,4 +1,4 @@
-"""What the machine, the container and the shell's limits leave to this process. Loads no jax."""
+"""What the machine, the container and the shell allow this process. Loads no jax."""
 
 import os
 import threading
@@ -9,26 +9,26 @@ from typing import NamedTuple
 from maxent_jax.errors import UsageError
 
 CGROUPS = Path("/sys/fs/cgroup")
-# XLA ends a process that cannot have its threads or its memory, without a word that helps.
-LEAST_ADDRESS_SPACE = 3 * 2**30  # bytes; for preset smoke on two cores 2.1 GiB was too little
-LEAST_FILES = 128  # open at once; with 24 Orbax cannot save, and says so in a traceback
+# Without enough threads or memory, XLA ends the process without a helpful message.
+LEAST_ADDRESS_SPACE = 3 * 2**30  # bytes; 2.1 GiB was too little for preset smoke on two cores
+LEAST_FILES = 128  # open at once; with 24, Orbax fails to save, with a traceback
 THREADS_PER_CORE, MORE_THREADS = 4, 16
 
 
 class Room(NamedTuple):
-    """Memory that there is."""
+    """An amount of memory, and what it belongs to."""
 
     size: int  # bytes
-    of: str  # whose it is, in words
+    of: str  # what it belongs to, in words
 
 
 def memory() -> Room:
-    """What this process may have of the machine's memory."""
+    """Returns the memory that this process may use."""
     return min(_limits(), key=lambda room: room.size)
 
 
 def readable(size: float) -> str:
-    """A number of bytes in the largest unit that fits."""
+    """Formats a number of bytes in the largest unit that fits."""
     units = ["bytes", "KiB", "MiB", "GiB", "TiB", "PiB"]
     while size >= 1024 and len(units) > 1:
         size /= 1024
@@ -37,10 +37,10 @@ def readable(size: float) -> str:
 
 
 def check_limits() -> None:
-    """Whether jax can start at all.
+    """Checks that jax can start.
 
     Raises:
-      UsageError: a limit of the shell's is too low for it.
+      UsageError: a limit of the shell or the container is too low.
     """
     limit = address_space()
     if limit and limit < LEAST_ADDRESS_SPACE:
@@ -63,7 +63,7 @@ def check_limits() -> None:
 
 
 def address_space() -> int | None:
-    """`ulimit -v` in bytes; None where there is no limit."""
+    """Returns `ulimit -v` in bytes; None if there is no limit."""
     return _limit("RLIMIT_AS")
 
 
@@ -97,12 +97,12 @@ def _can_start(num_threads: int) -> bool:
 def _limits() -> Iterator[Room]:
     try:
         yield Room(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"), "this machine")
-    except (AttributeError, ValueError, OSError):  # a system that does not tell
+    except (AttributeError, ValueError, OSError):  # unknown to this system
         yield Room(2**63, "this machine")
     for path in _cgroup_files():
         try:
             yield Room(int(path.read_text(encoding="ascii")), "this container")
-        except (OSError, ValueError):  # not there; or "max", no limit
+        except (OSError, ValueError):  # no such file; or "max", no limit
             continue
     yield from _process_limits()
 
@@ -126,7 +126,7 @@ def _cgroup_files() -> Iterator[Path]:
 
 
 def _process_limits() -> Iterator[Room]:
-    """`ulimit -v`, less what the process has already."""
+    """`ulimit -v` minus what the process already uses."""
     try:
         if limit := address_space():
             pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])

@@ -1,7 +1,7 @@
-"""Does a run fit into memory? Answered from shapes, before anything is allocated or compiled.
+"""Estimates from shapes whether a run fits into memory, before anything is allocated or compiled.
 
-The estimate is a lower bound, the state and the largest arrays beside it: what is refused cannot
-run, and what is not refused may still fail, with a sentence and exit code 1.
+The estimate is a lower bound: the state and the largest arrays next to it. A run that is refused
+cannot fit; a run that is accepted can still run out of memory, with a sentence and exit code 1.
 """
 
 import functools
@@ -19,17 +19,17 @@ from maxent_jax.runs import machine
 from maxent_jax.runs.machine import Room, readable
 
 FLOAT = 4  # bytes
-LARGE_POLICY = 2**28  # bytes of one: from here on the networks are to blame, and not their number
+LARGE_POLICY = 2**28  # bytes of one; from here on, a message blames their size, not their number
 MANY_COPIES = 64
-# Whose arrays devices that train one seed divide among them, see devices.placement.
+# Settings whose arrays the devices of a seed divide among them, see devices.placement.
 DIVIDED = ("replay-size", "yaw-copies", "num-envs")
 
 
 def check(config: Config, devices: Sequence[jax.Device]) -> None:
-    """Refuses a run that cannot fit, by the setting that takes the most.
+    """Rejects a run that cannot fit, and names the setting that takes the most memory.
 
     Raises:
-      ConfigError: it needs more than a device, the machine, or this process may have.
+      ConfigError: it needs more memory than a device, the machine or this process has.
     """
     need, room = on_a_device(config, len(devices)), _room(devices)
     total = sum(need.values())
@@ -40,22 +40,22 @@ def check(config: Config, devices: Sequence[jax.Device]) -> None:
         setting = "num-seeds"
     value = config[setting.replace("-", "_")]
     raise ConfigError(
-        f"{setting} is {value}, with which the run needs at least {readable(total)} of memory, "
+        f"{setting} is {value}, so the run needs at least {readable(total)} of memory, "
         f"but {room.of} has {readable(room.size)}: choose a smaller {setting}."
     )
 
 
 def check_episodes(config: Config, num_episodes: int) -> None:
-    """As `check_rows`, of the states of episodes."""
+    """As `check_rows`, for the states of whole episodes."""
     what = f"states ({num_episodes} episodes of {config.environment.episode_length} steps)"
     check_rows(config, num_episodes * config.environment.episode_length, what)
 
 
 def check_rows(config: Config, num_rows: int, what: str) -> None:
-    """Refuses states of the config's environment that cannot all be held at once.
+    """Rejects a number of states that cannot be held in memory together.
 
     Raises:
-      ConfigError: they alone need more memory than there is, or are more than 32 bits can count.
+      ConfigError: the states need too much memory, or are more than 32 bits can count.
     """
     room = _room(jax.devices()[:1])
     total = num_rows * _bytes_of_a_visit(config)
@@ -69,10 +69,10 @@ def check_rows(config: Config, num_rows: int, what: str) -> None:
 
 
 def on_a_device(config: Config, num_devices: int = 1) -> dict[str, int]:
-    """Bytes that a run needs at least on each of its devices, by the setting that they grow with.
+    """Returns the fewest bytes that a run needs per device, by the setting they grow with.
 
-    Beside the state: in `begin` and `end` the states that the mixture visits, an actor for each
-    episode, and two agents to start from; in a step the batches that were drawn.
+    In addition to the state, `begin` and `end` need the states that the mixture visits, an actor
+    for each episode, and two agents to start from; a step needs the batches drawn for it.
     """
     c, one_seed = config, of_a_seed(config.program())
     across_seeds = math.gcd(c.num_seeds, num_devices)
@@ -85,7 +85,7 @@ def on_a_device(config: Config, num_devices: int = 1) -> dict[str, int]:
 
 @functools.lru_cache(maxsize=8)
 def of_a_seed(config: Config) -> dict[str, int]:
-    """Of one seed of that program."""
+    """Returns the same as `on_a_device`, for one seed of a program."""
     c, state = config, algorithm.shapes(config)
     learner = state.learner
     policies, agent = nbytes(state.archive), nbytes(learner.agent)
@@ -122,12 +122,12 @@ def of_a_seed(config: Config) -> dict[str, int]:
 
 
 def nbytes(tree: Any) -> int:
-    """Of all arrays of a tree, or of their shapes."""
+    """Returns the bytes of all arrays of a tree, or of their shapes."""
     return sum(math.prod(x.shape) * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
 def _room(devices: Sequence[jax.Device]) -> Room:
-    """Of each device: its own memory, or its share of the machine's."""
+    """Memory of each device: its own, or its share of the machine's."""
     device = devices[0]
     limit = (device.memory_stats() or {}).get("bytes_limit") if device.platform != "cpu" else None
     if limit:
@@ -138,6 +138,6 @@ def _room(devices: Sequence[jax.Device]) -> Room:
 
 
 def _bytes_of_a_visit(config: Config) -> int:
-    """Of a state that a rollout reached: itself, its features, its policy and its weight."""
+    """Bytes of a state in a rollout: the state, its features, its policy and its weight."""
     made = components.make(config)
     return FLOAT * (made.sac.observation_size + len(made.phi.names) + 2)

@@ -1,4 +1,4 @@
-"""Progress on standard error: a bar in a terminal, elsewhere a line an iteration."""
+"""Progress on standard error: a bar in a terminal, otherwise one line per iteration."""
 
 import sys
 import time
@@ -23,18 +23,18 @@ from rich.text import Text
 from maxent_jax.config import Config
 
 Item = TypeVar("Item")
-# Until the end of the first segment, by whether jax simulates too. Measured on two cores, from a
-# processor with AVX-512 to a slow one with AVX2.
+# Time to the end of the first segment, by whether jax also simulates. Measured on two cores, from
+# a processor with AVX-512 to a slow one with AVX2.
 COMPILING = {False: "15 to 50 s", True: "1 to 3 min"}
 
 
 def say(sentence: str) -> None:
-    """One line on standard error."""
+    """Prints one line on standard error."""
     print(sentence, file=sys.stderr, flush=True)
 
 
 def announce(config: Config, directory: Path, iterations_done: int) -> None:
-    """What is about to happen, and how long it takes until something is to be seen."""
+    """Says what will be trained, and how long it takes until progress is shown."""
     c = config
     last = c.seed + c.num_seeds - 1
     seeds = f"seed {c.seed}" if c.num_seeds == 1 else f"seeds {c.seed} to {last}"
@@ -43,13 +43,13 @@ def announce(config: Config, directory: Path, iterations_done: int) -> None:
     say(
         f"{c.method} on {c.env}, preset {c.preset}, {seeds}: "
         f"{c.budget.num_iterations} iterations{done}, {env_steps:,} env steps, into {directory}\n"
-        f"compiling, about {COMPILING[c.simulates_in_jax]}, less where programs are cached; "
+        f"compiling, about {COMPILING[c.simulates_in_jax]}, less if programs are cached; "
         f"Ctrl-C saves the run"
     )
 
 
 def duration(seconds: float) -> str:
-    """As people say it: 45 s, 6 min 42 s, 3 h 20 min."""
+    """Formats seconds for people: 45 s, 6 min 42 s, 3 h 20 min."""
     minutes, left = divmod(round(seconds), 60)
     if minutes == 0:
         return f"{left} s"
@@ -58,16 +58,16 @@ def duration(seconds: float) -> str:
 
 
 def track(items: Sequence[Item], what: str) -> Iterable[Item]:
-    """The items, with a progress line on standard error where that is a terminal."""
+    """Returns the items, with a progress line on standard error if that is a terminal."""
     console = Console(stderr=True)
     return progress.track(items, what, console=console, disable=not console.is_terminal)
 
 
 class Bar:
-    """How far a run has come: a bar in a terminal, elsewhere a line at the end of an iteration."""
+    """Shows a run's progress: a bar in a terminal, otherwise a line after each iteration."""
 
     def __init__(self, config: Config, iteration: int, segments: int, last_row: dict[str, Any]):
-        """At that many complete iterations and segments of the next; the last row, if any."""
+        """Starts after so many iterations and segments of the next; takes the last row, if any."""
         console = Console(stderr=True)
         self._in_terminal = console.is_terminal
         self._progress = Progress(
@@ -100,7 +100,7 @@ class Bar:
         self._progress.stop()
 
     def segment_done(self) -> None:
-        """After a segment."""
+        """Updates the bar after a segment."""
         c, now = self._config, time.perf_counter()
         steps = c.num_seeds * c.vector_steps * c.budget.num_envs
         self._rate = [f"{steps / (now - self._last):,.0f} steps/s"]
@@ -113,7 +113,7 @@ class Bar:
         self._show()
 
     def iteration_done(self, row: dict[str, Any]) -> None:
-        """After the end of an iteration, which may have come before its last segment."""
+        """Updates the bar after an iteration, which can end before its last segment."""
         self._iteration, self._segments = self._iteration + 1, 0
         self._reached, self._last = _reached(row), time.perf_counter()
         self._show()
@@ -122,7 +122,7 @@ class Bar:
         self._line(_together(name, *self._spent(), *self._reached, spent))
 
     def _left(self) -> str:
-        """An estimate, from all segments of this process but the first, which is compiled."""
+        """Estimates the time left from this process's segments except the first, which compiles."""
         left = (
             self._config.budget.num_iterations * self._config.budget.num_segments
             - self._done_segments()
@@ -133,7 +133,7 @@ class Bar:
         return f", about {duration(left * rate)} left"
 
     def _line(self, sentence: str) -> None:
-        """Where a bar cannot move."""
+        """Prints a line where there is no bar."""
         if not self._in_terminal:
             say(sentence)
 
@@ -161,7 +161,7 @@ class Bar:
 
 
 class _Status(TextColumn):
-    """The one column that a narrow terminal cuts."""
+    """The only column that a narrow terminal cuts."""
 
     def render(self, task: Task) -> Text:
         text = super().render(task)
@@ -174,7 +174,7 @@ def _together(*parts: str) -> str:
 
 
 def _reached(row: dict[str, Any]) -> list[str]:
-    """Coverage and entropy, of all seeds on average."""
+    """Coverage and entropy, averaged over seeds."""
     if not row:
         return []
     coverage = np.mean(row["cumulative_coverage"])

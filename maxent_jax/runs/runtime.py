@@ -1,7 +1,7 @@
-"""What a process settles before jax computes anything. Imports jax only when it is called.
+"""Sets up jax before it computes anything. Imports jax only when called.
 
-Environment variables of jax's that would change our programs are overruled, and those with which
-jax cannot start are refused in a sentence.
+Overrides environment variables of jax that would change our programs, and rejects those with which
+jax cannot start.
 """
 
 import os
@@ -15,8 +15,8 @@ from maxent_jax.errors import UsageError
 from maxent_jax.runs import machine
 
 IN_ORDER = "--xla_cpu_enable_concurrency_optimized_scheduler=false"
-# Options that users set for other programs. Ours are written in 32 bits, for jit, and with
-# infinities and NaN where they mean something; their results are those without these variables.
+# Options that users set for other programs. Ours need 32 bits and jit, and use infinities and NaN
+# on purpose, so their results are those without these variables.
 SETTLED = {
     "jax_enable_x64": False,
     "jax_debug_nans": False,
@@ -37,15 +37,15 @@ PROBE_SECONDS = 60
 
 
 def prepare(simulates_in_jax: bool) -> None:
-    """Loads jax, with the options that our programs expect and its persistent compilation cache.
+    """Loads jax with the options that our programs expect and its persistent compilation cache.
 
     Args:
       simulates_in_jax: physics in jax (MJX, brax) will run; on a CPU its threads then run in order.
-        XLA of jaxlib 0.10 otherwise locks up in MJX's Humanoid (all threads idle, for ever), from
-        64 environments on. It costs other programs 5 to 10 %, and must precede the first
+        Otherwise XLA of jaxlib 0.10 locks up in MJX's Humanoid (all threads idle, for ever), from
+        64 environments on. This costs other programs 5 to 10 %, and must precede the first
         computation. A user's own XLA_FLAGS are kept.
     Raises:
-      UsageError: the environment has a variable, or the shell a limit, with which jax cannot start.
+      UsageError: jax cannot start with an environment variable or a limit of the shell.
     """
     if "jax" not in sys.modules:
         machine.check_limits()
@@ -61,16 +61,16 @@ def prepare(simulates_in_jax: bool) -> None:
 
 
 def start(simulates_in_jax: bool) -> None:
-    """`prepare`, and `check_devices`, for a process that computes alone."""
+    """Calls `prepare` and `check_devices`, for a process that computes alone."""
     prepare(simulates_in_jax)
     check_devices()
 
 
 def check_devices() -> None:
-    """Starts jax's backend; several processes must have met before.
+    """Starts jax's backend; several processes must call `hosts.join` before.
 
     Raises:
-      UsageError: there is no device, or none of the kind that the environment asks for.
+      UsageError: there is no device, or none of the kind that an environment variable names.
     """
     import jax
     import jax.numpy as jnp
@@ -78,7 +78,7 @@ def check_devices() -> None:
     try:
         jax.devices()
         jnp.zeros(()).block_until_ready()
-    except Exception as error:  # of every kind, by what is missing
+    except Exception as error:  # its class depends on what is missing
         said = _first_line(error).split(" (set JAX_PLATFORMS")[0]
         reason = f" ({said})" if str(error) else ""
         for variable in ("JAX_PLATFORMS", "JAX_DEFAULT_DEVICE"):
@@ -94,13 +94,13 @@ def check_devices() -> None:
 def _load() -> ModuleType:
     try:
         import jax
-    except (ValueError, RuntimeError) as error:  # a variable that it reads when it is loaded
+    except (ValueError, RuntimeError) as error:  # from a variable that jax reads when it is loaded
         raise UsageError(f"jax cannot be loaded: {_first_line(error)}") from None
     return jax
 
 
 def _check_flags() -> None:
-    """Where the user has set XLA_FLAGS: XLA ends a process for a flag that it does not know."""
+    """Tries the user's XLA_FLAGS in another process, which XLA ends for an unknown flag."""
     flags = os.environ.get("XLA_FLAGS", "").replace(IN_ORDER, "").strip()
     if not flags:
         return
@@ -117,12 +117,14 @@ def _check_flags() -> None:
     if done.returncode:
         lines = [line for line in done.stderr.splitlines() if "XLA_FLAGS" in line or "lag" in line]
         reason = f" ({lines[0].split('] ')[-1].strip()})" if lines else ""
-        raise UsageError(f"XLA_FLAGS is '{flags}', with which XLA cannot start{reason}.")
+        raise UsageError(
+            f"XLA_FLAGS is '{flags}', but XLA cannot start with it{reason}: correct or unset it."
+        )
 
 
 def _settle_cache(jax: ModuleType) -> None:
-    """In the user's own cache folder, unless jax was told of another; off where it is read-only."""
-    if not jax.config.values["jax_enable_compilation_cache"]:  # as the user or we have settled
+    """Puts the cache in the user's cache folder unless jax has one; off if it is read-only."""
+    if not jax.config.values["jax_enable_compilation_cache"]:  # off, by the user or by us
         return
     folder = jax.config.values["jax_compilation_cache_dir"]
     try:
@@ -133,12 +135,12 @@ def _settle_cache(jax: ModuleType) -> None:
             Path(folder).mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
                 pass
-    except (OSError, RuntimeError, ValueError) as error:  # RuntimeError: there is no home
+    except (OSError, RuntimeError, ValueError) as error:  # RuntimeError: no home directory
         jax.config.update("jax_enable_compilation_cache", False)
         reason = getattr(error, "strerror", None) or error
         print(
-            f"note: programs are compiled anew each time, for {folder or 'the cache folder'} "
-            f"cannot be written: {reason}.",
+            f"note: programs are compiled again at each start, because "
+            f"{folder or 'the cache folder'} cannot be written: {reason}.",
             file=sys.stderr,
         )
         return

@@ -1,8 +1,8 @@
-"""SIGINT, SIGTERM and SIGHUP (a terminal that closes): the first lets a run save where it next can,
-a second Ctrl-C ends it at once.
+"""Lets a run save itself at SIGINT, SIGTERM or SIGHUP; a second Ctrl-C ends it at once.
 
-Python runs a signal's handler between two of its own instructions, and a compiled program may take
-minutes. So a thread reads what the signal leaves in a pipe, whatever the main thread is at.
+SIGHUP is sent when a terminal closes. Python runs a signal handler between two of its own
+instructions, and a compiled program can take minutes. So a thread reads the signal from a pipe,
+whatever the main thread does.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, 
 
 
 def heeded() -> tuple[signal.Signals, ...]:
-    """Those that this process answers: under nohup SIGHUP stays ignored."""
+    """Returns the signals that this process handles; under nohup, SIGHUP stays ignored."""
     return tuple(
         number
         for number in SIGNALS
@@ -26,15 +26,15 @@ def heeded() -> tuple[signal.Signals, ...]:
 
 
 class Interrupted(Exception):
-    """A run that was asked to stop, and has saved itself."""
+    """A signal asked the run to stop, and the run has saved itself."""
 
     def __init__(self, received: int, directory: Path):
-        """By the signal of that number; saved in that directory."""
+        """Takes the number of the signal, and the directory in which the run is saved."""
         self.exit_code = 128 + received
         name = signal.Signals(received).name
         super().__init__(
-            f"stopped by {name} and saved in {directory}: --resume goes on; "
-            f"a study's command does so by itself."
+            f"stopped by {name} and saved in {directory}: continue with --resume; "
+            f"a study's command continues by itself."
         )
 
 
@@ -47,7 +47,7 @@ class Interruption:
         self._reading, self._writing = socket.socketpair()
         self._writing.setblocking(False)
         self._wakeup = signal.set_wakeup_fd(self._writing.fileno())
-        # A handler in Python, though it does nothing, is what makes the signal reach the pipe.
+        # A handler in Python, although it does nothing, makes the signal reach the pipe.
         self._handlers = {n: signal.signal(n, lambda *_: None) for n in heeded()}
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()
@@ -70,7 +70,7 @@ class Interruption:
                 self.received = number
                 with contextlib.suppress(OSError, ValueError):  # the terminal may be gone
                     print(
-                        "stopping at the next checkpoint; Ctrl-C once more to stop at once",
+                        "stopping at the next checkpoint; press Ctrl-C again to stop at once",
                         file=sys.stderr,
                         flush=True,
                     )

@@ -1,4 +1,4 @@
-"""A run goes on by one program at a time: the beginning of an iteration, a segment, or its end."""
+"""Advances a run by one program: the beginning of an iteration, a segment, or its end."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from maxent_jax.runs.progress import Bar
 
 
 class Stage(NamedTuple):
-    """Where a run stands."""
+    """The state of a run and its progress."""
 
     state: State
     progress: Progress
@@ -32,7 +32,7 @@ def advance(
     clock: Clock,
     bar: Bar,
 ) -> Stage:
-    """The next of the three programs of an iteration, with the clock read and the bar moved."""
+    """Runs the next of the three programs of an iteration, and updates clock and bar."""
     if progress.begun is None:
         state, begun = clock.time("wall_begin", programs.begin, state)
         return Stage(state, progress._replace(begun=begun))
@@ -47,7 +47,7 @@ def advance(
 
 
 def _row(config: Config, progress: Progress, at_end: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The line of metrics.jsonl for an iteration, but for its times."""
+    """The line of metrics.jsonl for an iteration, without its times."""
     segments = progress.segments
     stacked = jax.tree.map(lambda *x: np.stack(x), *segments)
     rewards = np.full((*stacked["step_reward"].shape[1:], config.budget.num_segments), np.nan)
@@ -70,7 +70,7 @@ def _trained(config: Config, segments: list[dict[str, np.ndarray]]) -> bool:
 
 
 def _all_converged(config: Config, segments: list[dict[str, np.ndarray]]) -> bool:
-    """Of all seeds, which train in step."""
+    """Whether all seeds, which train in step, have converged."""
     rewards = np.stack([metrics["step_reward"] for metrics in segments], axis=-1)
     return all(
         has_plateaued(
@@ -81,10 +81,10 @@ def _all_converged(config: Config, segments: list[dict[str, np.ndarray]]) -> boo
 
 
 def check_finite(directory: Path, state: State, progress: Progress) -> None:
-    """Before anything of it is written.
+    """Checks a state before it is saved.
 
     Raises:
-      NonFiniteError: a number of the state is not finite.
+      NonFiniteError: the state holds a number that is not finite.
     """
     leaves = jax.tree_util.tree_flatten_with_path(jax.device_get(_finite(state)))[0]
     wrong = [path for path, is_finite in leaves if not is_finite]
@@ -92,15 +92,16 @@ def check_finite(directory: Path, state: State, progress: Progress) -> None:
         where = jax.tree_util.keystr(wrong[0], simple=True, separator=".")
         iteration = len(progress.rows) + (progress.begun is not None)
         raise errors.NonFiniteError(
-            f"iteration {iteration} left the finite numbers after {len(progress.segments)} of its "
-            f"segments (first in {where}); nothing of that is saved, {directory} holds the run "
-            f"up to checkpoint {(integrity.checkpoints(directory) or ['none'])[-1]}."
+            f"iteration {iteration} produced a number that is not finite after "
+            f"{len(progress.segments)} of its segments (first in {where}): this is not saved, and "
+            f"{directory} holds the run up to checkpoint "
+            f"{(integrity.checkpoints(directory) or ['none'])[-1]}."
         )
 
 
 @jax.jit
 def _finite(state: State) -> State:
-    """Of each leaf, whether all its numbers are finite."""
+    """Whether all numbers are finite, for each leaf."""
 
     def of_leaf(x: jax.Array) -> jax.Array:
         return jnp.isfinite(x).all() if jnp.issubdtype(x.dtype, jnp.floating) else jnp.array(True)

@@ -1,1 +1,1 @@
-"""Soft actor-critic as pure functions: networks, replay, losses, agent (init / update / act)."""
+"""Soft actor-critic as pure functions: networks, replay buffer, losses, agent."""

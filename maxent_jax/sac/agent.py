@@ -1,4 +1,4 @@
-"""The SAC learner: init, update, act. Settings come from a Config; sizes from the caller."""
+"""The SAC learner: init, update, act. A Config gives the settings, the caller the sizes."""
 
 from typing import Any, NamedTuple, cast
 
@@ -13,18 +13,18 @@ from maxent_jax.sac import losses
 from maxent_jax.sac.networks import Actor, Critic, Inputs
 from maxent_jax.types import Metrics
 
-LARGEST_INPUT = 10.0  # deviations; a state far from all that were seen is cut off there
+LARGEST_INPUT = 10.0  # standard deviations, at which normalised inputs are clipped
 
 
 class Policy(NamedTuple):
-    """What acting takes."""
+    """What `act` needs."""
 
     actor: Any
-    moments: Moments | None  # of the inputs; None: they pass unchanged
+    moments: Moments | None  # of the inputs; None: inputs are not normalised
 
 
 class Parameters(NamedTuple):
-    """What the mixture archives of an agent."""
+    """The part of an agent that the mixture archives."""
 
     actor: Any
     critic: Any
@@ -34,20 +34,20 @@ class Parameters(NamedTuple):
 
     @property
     def policy(self) -> Policy:
-        """The actor, with the moments of the inputs that it was trained on."""
+        """The actor, and the moments of the inputs that it was trained with."""
         return Policy(self.actor, self.moments)
 
 
 class Agent(NamedTuple):
-    """A learner: what it knows, and its optimisers' state."""
+    """A learner: its parameters and the state of its optimisers."""
 
     parameters: Parameters
     optimizer: Any
-    average: Any  # of the actor over its updates; None where that is not what is archived
+    average: Any  # moving average of the actor, which is archived then; else None
 
 
 class Sac(NamedTuple):
-    """The fixed part of a learner: modules, and the transform from observation to inputs."""
+    """The static part of a learner: modules, settings, and the map from observations to inputs."""
 
     actor: Actor
     critic: Critic
@@ -65,7 +65,7 @@ class Sac(NamedTuple):
 
 
 def make(config: Config, observation_size: int, action_size: int, inputs: Inputs) -> Sac:
-    """A learner of that size, with the settings of the config."""
+    """Makes the static part of a learner, with the settings of the config."""
     own = config.learner
     return Sac(
         actor=Actor(action_size, own.hidden_layers, own.hidden_size),
@@ -89,7 +89,7 @@ def make(config: Config, observation_size: int, action_size: int, inputs: Inputs
 
 
 def init(sac: Sac, key: jax.Array) -> Agent:
-    """A fresh learner."""
+    """Makes a learner with random parameters."""
     key_actor, key_critic = jax.random.split(key)
     inputs = sac.inputs(jnp.zeros(sac.observation_size))
     critic = sac.critic.init(key_critic, inputs, jnp.zeros(sac.action_size))
@@ -106,13 +106,22 @@ def init(sac: Sac, key: jax.Array) -> Agent:
 
 
 def restart(sac: Sac, parameters: Parameters) -> Agent:
-    """A learner that knows what `parameters` know, with fresh optimisers."""
+    """Makes a learner with these parameters and fresh optimisers."""
     average = jax.tree.map(jnp.copy, parameters.actor) if sac.average_rate else None
     return Agent(parameters, sac.optimizer.init(_learned(parameters)), average)
 
 
 def see(sac: Sac, agent: Agent, observation: jax.Array, counts: jax.Array) -> Agent:
-    """With the moments of its inputs after those states [N, D] that count, [N] bool."""
+    """Updates the moments of the inputs, if the agent has them.
+
+    Args:
+      sac: the static part.
+      agent: the learner.
+      observation: [N, D].
+      counts: [N] bool, the states that count.
+    Returns:
+      The learner with updated moments.
+    """
     parameters = agent.parameters
     if parameters.moments is None:
         return agent
@@ -121,7 +130,7 @@ def see(sac: Sac, agent: Agent, observation: jax.Array, counts: jax.Array) -> Ag
 
 
 def archived(agent: Agent) -> Parameters:
-    """What the mixture keeps of it."""
+    """Returns the parameters that the mixture archives."""
     if agent.average is None:
         return agent.parameters
     return agent.parameters._replace(actor=agent.average)
@@ -130,7 +139,7 @@ def archived(agent: Agent) -> Parameters:
 def act(
     sac: Sac, policy: Policy, observation: jax.Array, key: jax.Array, deterministic: bool = False
 ) -> jax.Array:
-    """An action drawn from the policy, or its mean: [..., D] -> [..., A] in [-1, 1]."""
+    """Draws an action from the policy, or returns its mean: [..., D] -> [..., A] in [-1, 1]."""
     mean, log_std = _policy(sac, policy.actor, _inputs(sac, policy.moments, observation))
     if deterministic:
         return jnp.tanh(mean)
@@ -138,7 +147,7 @@ def act(
 
 
 def value(sac: Sac, parameters: Parameters, observation: jax.Array, key: jax.Array) -> jax.Array:
-    """The critics' estimate of a state's soft value by one action drawn, [..., D] -> [...]."""
+    """Estimates the soft value of states with one drawn action each, [..., D] -> [...]."""
     inputs = _inputs(sac, parameters.moments, observation)
     action, log_prob = losses.sample_action(*_policy(sac, parameters.actor, inputs), key)
     values = _values(sac, parameters.target_critic, inputs, action)
@@ -147,7 +156,7 @@ def value(sac: Sac, parameters: Parameters, observation: jax.Array, key: jax.Arr
 
 
 def update(sac: Sac, agent: Agent, batch: losses.Batch, key: jax.Array) -> tuple[Agent, Metrics]:
-    """One gradient step of critics, actor and temperature, and of the target critics after them."""
+    """Takes one gradient step of critics, actor and temperature, then moves the target critics."""
     key_next, key_actor = jax.random.split(key)
     parameters = agent.parameters
     inputs = _inputs(sac, parameters.moments, batch.observation)

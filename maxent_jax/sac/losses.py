@@ -7,17 +7,26 @@ import jax.numpy as jnp
 
 
 class Batch(NamedTuple):
-    """What one update learns from."""
+    """Transitions for one update."""
 
     observation: jax.Array  # [B, D]
     action: jax.Array  # [B, A], in [-1, 1]
-    reward: jax.Array  # [B], or the discounted sum of n
+    reward: jax.Array  # [B], or the discounted sum of n rewards
     next_observation: jax.Array  # [B, D]
     discount: jax.Array  # [B] 0 at a terminal state, else γ^(n-1); a time limit is not terminal
 
 
 def sample_action(mean: jax.Array, log_std: jax.Array, key: jax.Array):
-    """A tanh-squashed Gaussian action [..., A] and its log-probability [...], nats (Eq. 26)."""
+    """Draws an action from a tanh-squashed Gaussian.
+
+    Args:
+      mean: [..., A] before the tanh.
+      log_std: [..., A] before the tanh.
+      key: draws the action.
+    Returns:
+      The action [..., A] and its log-probability [...], in nats.
+    Source: Eq. 26.
+    """
     noise = jax.random.normal(key, mean.shape)
     raw = mean + jnp.exp(log_std) * noise
     log_gaussian = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
@@ -27,25 +36,53 @@ def sample_action(mean: jax.Array, log_std: jax.Array, key: jax.Array):
 
 
 def critic_loss(values: jax.Array, target: jax.Array) -> jax.Array:
-    """Sum over the critics [B, 2] of the mean squared error from the target [B] (Eq. 5)."""
+    """Returns the mean squared error of the critics, summed over them.
+
+    Args:
+      values: [B, 2].
+      target: [B].
+    Returns:
+      [] the loss.
+    Source: Eq. 5.
+    """
     return jnp.mean(jnp.sum((values - target[:, None]) ** 2, axis=-1))
 
 
 def bellman_target(batch: Batch, next_value: jax.Array, discount: float) -> jax.Array:
-    """r + γ V(s'), V = min Q - α log π, and no V beyond a terminal state (Eq. 2 and 3).
+    """Returns r + γ V(s') with V = min Q - α log π, without V after a terminal state, [B] -> [B].
 
-    With n steps, r is their discounted sum, s' the last state, and the discount γ^(n-1) more.
+    With n steps, r is their discounted sum, s' the last state, and V has a further factor γ^(n-1).
+
+    Source: Eq. 2 and 3.
     """
     return batch.reward + discount * batch.discount * next_value
 
 
 def actor_loss(log_prob: jax.Array, values: jax.Array, temperature: jax.Array) -> jax.Array:
-    """mean of α log π - min Q (Eq. 7)."""
+    """Returns the mean of α log π - min Q.
+
+    Args:
+      log_prob: [B] log π, nats.
+      values: [B, 2] Q of both critics.
+      temperature: [] α.
+    Returns:
+      [] the loss.
+    Source: Eq. 7.
+    """
     return jnp.mean(temperature * log_prob - jnp.min(values, axis=-1))
 
 
 def temperature_loss(
     log_temperature: jax.Array, log_prob: jax.Array, target_entropy: float
 ) -> jax.Array:
-    """α falls while the policy's entropy is above its target (Eq. 18), learned as log α."""
+    """Returns a loss that lowers α while the policy's entropy is above its target.
+
+    Args:
+      log_temperature: [] log α, which is what is learned.
+      log_prob: [B] log π, nats.
+      target_entropy: nats.
+    Returns:
+      [] the loss.
+    Source: Eq. 18.
+    """
     return -jnp.exp(log_temperature) * jnp.mean(jax.lax.stop_gradient(log_prob) + target_entropy)

@@ -1,4 +1,4 @@
-"""Policies, critics, and the networks of the bonuses; the only flax modules of the package."""
+"""Networks of policies, critics and bonuses: the only flax modules of the package."""
 
 from collections.abc import Callable
 
@@ -10,7 +10,7 @@ LOG_STD_RANGE = (-5.0, 2.0)  # of the Gaussian before the tanh
 
 
 class Torso(nn.Module):
-    """Hidden layers of one size, ReLU; with layer norm before each ReLU where asked."""
+    """[..., I] -> [..., size]: ReLU layers of one size, layer norm before each ReLU if set."""
 
     num_layers: int
     size: int
@@ -27,7 +27,7 @@ class Torso(nn.Module):
 
 
 class Mlp(nn.Module):
-    """[..., I] -> [..., O]: hidden layers of one size, ReLU, and a linear output."""
+    """[..., I] -> [..., O]: hidden ReLU layers of one size, and a linear output."""
 
     num_layers: int
     size: int
@@ -50,7 +50,7 @@ class Trunk(nn.Module):
 
 
 class Actor(nn.Module):
-    """[..., I] -> mean and log standard deviation, [..., A] each, of the action before its tanh."""
+    """[..., I] -> mean and log standard deviation of the action before its tanh, [..., A] each."""
 
     action_size: int
     num_layers: int
@@ -64,7 +64,7 @@ class Actor(nn.Module):
 
 
 class GaussianPolicy(nn.Module):
-    """[..., I] -> mean, 0 at first, and log standard deviation, one for all states, [..., A]."""
+    """[..., I] -> mean, initially 0, and log standard deviation, equal in all states, [..., A]."""
 
     action_size: int
     num_layers: int
@@ -81,7 +81,7 @@ class GaussianPolicy(nn.Module):
 
 
 class Critic(nn.Module):
-    """[..., I], [..., A] -> Q [..., 2]: two networks that share nothing."""
+    """[..., I], [..., A] -> Q [..., 2] of two networks that share nothing."""
 
     num_layers: int
     size: int

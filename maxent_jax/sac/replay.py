@@ -1,4 +1,4 @@
-"""A ring of experience as frozen state and functions; inserting costs the same when it is full."""
+"""The replay buffer: a ring, as immutable state and functions. Adding costs the same when full."""
 
 from typing import Any, NamedTuple
 
@@ -15,13 +15,13 @@ class Replay(NamedTuple):
 
 
 def init(item: Any, capacity: int) -> Replay:
-    """An empty ring for items of the shapes and dtypes of `item`, which has no leading axis."""
+    """Returns an empty ring for items like `item`, which has no leading axis."""
     items = jax.tree.map(lambda x: jnp.zeros((capacity, *x.shape), x.dtype), item)
     return Replay(items, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
 
 
 def add(replay: Replay, items: Any, valid: jax.Array) -> Replay:
-    """With the valid rows of `items` [B, ...] inserted, over the oldest once it is full."""
+    """Adds the `valid` [B] rows of `items` [B, ...]; a full ring overwrites its oldest rows."""
     capacity = capacity_of(replay)
     num_added = jnp.sum(valid, dtype=jnp.int32)
     rows = destinations(replay, valid)
@@ -33,7 +33,7 @@ def add(replay: Replay, items: Any, valid: jax.Array) -> Replay:
 
 
 def destinations(replay: Replay, valid: jax.Array) -> jax.Array:
-    """[B] int32: where `add` puts each of the rows; the capacity for one that it drops."""
+    """Returns where `add` puts each row, [B] bool -> [B] int32; the capacity for a dropped row."""
     capacity = capacity_of(replay)
     offset = jnp.cumsum(valid, dtype=jnp.int32) - 1
     # Of more rows than places only the last stay: a scatter leaves open which duplicate wins.
@@ -42,10 +42,13 @@ def destinations(replay: Replay, valid: jax.Array) -> jax.Array:
 
 
 def draw(replay: Replay, shape: tuple[int, ...], key: jax.Array, skip: int = 0) -> jax.Array:
-    """Filled rows, int32 of that shape, drawn uniformly, with replacement; 0 while it is empty.
+    """Draws filled rows uniformly with replacement, [*shape] int32; 0 from an empty ring.
 
     Args:
-      skip: once the ring is full, leave out so many of the oldest rows.
+      replay: the ring.
+      shape: of the draw.
+      key: of the draw.
+      skip: how many of the oldest rows to leave out when the ring is full.
     """
     capacity = capacity_of(replay)
     skipped = jnp.where(replay.size == capacity, skip, 0)
@@ -55,11 +58,11 @@ def draw(replay: Replay, shape: tuple[int, ...], key: jax.Array, skip: int = 0) 
 
 
 def sample(replay: Replay, shape: tuple[int, ...], key: jax.Array) -> Any:
-    """Items [*shape, ...] drawn uniformly, with replacement. Zeros while the ring is empty."""
+    """Draws items uniformly with replacement, [*shape, ...]; zeros from an empty ring."""
     rows = draw(replay, shape, key)
     return jax.tree.map(lambda x: x[rows], replay.items)
 
 
 def capacity_of(replay: Replay) -> int:
-    """The number of rows."""
+    """Returns the number of rows."""
     return jax.tree.leaves(replay.items)[0].shape[0]

@@ -1,1 +1,1 @@
-"""The paper's figures and the studies beside them: cells, raw values, statistics, pictures."""
+"""The paper's figures and further studies: cells, raw values, statistics, figures."""

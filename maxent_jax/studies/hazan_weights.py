@@ -19,12 +19,12 @@ SEEDS = {"toy": 2, "cpu": 10, "paper": 10}
 TOY: dict[str, Any] = dict(
     num_rounds=3, num_episodes=4, train_steps=20, horizon=20, num_runs=2, num_fresh=4
 )
-RANDOM_BESIDE = {  # what the random policy reaches, by what the mixture does
+RANDOM_BESIDE = {  # by measure of the mixture: the comparable measure of the random policy
     "running_entropy": "random_running_entropy",
     "density_entropy": "random_from_start_entropy",
     "fresh_entropy": "random_fresh_entropy",
 }
-# Of official.Trace, each [R, P]: nats, and cells.
+# Fields of hazan.Trace, each [R, P]: nats, and cells.
 KEPT = (*RANDOM_BESIDE, *RANDOM_BESIDE.values(), "coverage")
 RESULTS = "classic.json"
 
@@ -32,12 +32,12 @@ Results = dict[str, dict[str, Any]]
 
 
 def results(directory: Path, scale: str, num_seeds: int | None) -> Results:
-    """By environment; computed once, and read from the directory's file afterwards.
+    """Returns the results by environment: computes them once, then reads the directory's file.
 
-    All weightings and seeds of an environment are one program.
+    One program runs all weightings and seeds of an environment.
 
     Raises:
-      UsageError: see `held`.
+      UsageError: as in `held`.
     """
     before = held(directory, scale, num_seeds)
     if before is not None:
@@ -50,10 +50,10 @@ def results(directory: Path, scale: str, num_seeds: int | None) -> Results:
 
 
 def held(directory: Path, scale: str, num_seeds: int | None) -> Results | None:
-    """What the directory's file holds already, if there is one.
+    """Returns the results in the directory's file, or None if there is no file.
 
     Raises:
-      UsageError: it was made at another scale, or with other seeds or settings.
+      UsageError: the file was made at another scale, or with other seeds or settings.
     """
     path = directory / RESULTS
     if not path.exists():
@@ -85,10 +85,10 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def curves(found: Results) -> dict[str, dict[str, dict[str, np.ndarray]]]:
-    """By environment, measure and weighting, with the random policy: [seeds, rounds].
+    """Returns curves [seeds, rounds] by environment, measure and weighting or random policy.
 
-    The random policy stands once for each seed: it plays beside every weighting, the same episodes
-    but where they start in states of the mixture, so that it is the mean of those.
+    The random policy plays in the runs of every weighting. The episodes are the same unless they
+    start in states of the mixture, so its curve is the mean over the weightings.
     """
     by_env = {env: of_env["weightings"] for env, of_env in found.items()}
     return {
@@ -102,7 +102,7 @@ def curves(found: Results) -> dict[str, dict[str, dict[str, np.ndarray]]]:
 
 
 def table(found: Results) -> Mapping[str, Any]:
-    """By environment and measure: the last round, and uniform weights against all else."""
+    """Compares uniform weights with all others in the last round, by environment and measure."""
     return {
         f"{env}, {name}": statistics.compare({who: x[:, -1] for who, x in of.items()}, "uniform")
         for env, measures in curves(found).items()

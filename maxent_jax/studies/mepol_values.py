@@ -1,7 +1,7 @@
-"""MEPOL at the env steps of a study: it learns by other means, and is no run of `train`.
+"""MEPOL at the env steps of a study; it has its own learner, so `train` does not run it.
 
-Its gradient steps are what its trust region allows, far fewer than SAC's, each on a whole batch of
-episodes.
+It takes as many gradient steps as its trust region allows, far fewer than SAC, each on a whole
+batch of episodes.
 """
 
 import contextlib
@@ -25,13 +25,13 @@ METHOD, RESULTS = "MEPOL", "mepol.json"
 
 
 def rows(directory: Path, config: Config, num_seeds: int) -> list[Row]:
-    """A row for each seed and iteration; computed once, and read from the directory afterwards."""
+    """Returns a row per seed and iteration: computes them once, then reads the directory's file."""
     path = directory / RESULTS
     asked = files.jsonable(
         {"config": config.flat(), "seeds": num_seeds}
         | {"settings": dataclasses.asdict(settings_of(config))}
     )
-    with contextlib.suppress(OSError, ValueError, AttributeError):  # none yet, or a damaged one
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # no file yet, or a damaged one
         held = json.loads(path.read_text(encoding="utf-8"))
         if {name: held.get(name) for name in asked} == asked:
             return [values.known(row) for row in held["rows"]]
@@ -41,7 +41,7 @@ def rows(directory: Path, config: Config, num_seeds: int) -> list[Row]:
 
 
 def settings_of(config: Config) -> Settings:
-    """MEPOL's own, in batches of about its own size that fit into an iteration's env steps."""
+    """Returns MEPOL's defaults, with batches of about the usual size that fill an iteration."""
     usual = Settings.num_episodes * config.environment.episode_length
     num_epochs = max(1, round(config.budget.steps_per_iteration / usual))
     num_episodes = config.budget.steps_per_iteration // (

@@ -1,4 +1,4 @@
-"""The figures of a reproduction, from values and runs alone."""
+"""Draws the figures of a reproduction, from values and runs alone."""
 
 from collections.abc import Mapping, Sequence
 from itertools import chain
@@ -16,7 +16,7 @@ from maxent_jax.studies.statistics import interquartile_mean, interval_of_curves
 from maxent_jax.studies.values import RANDOM
 from maxent_jax.visual import plotting
 
-Axis = tuple[str, str, float]  # a column, what it is called, and its factor
+Axis = tuple[str, str, float]  # a column, its label, and its factor
 Band = tuple[np.ndarray, ...]  # middle, low, high; [iterations] each
 ENV_STEPS: Axis = ("env_steps", "thousand env steps", 1e-3)
 AXES: tuple[Axis, ...] = (
@@ -38,7 +38,7 @@ Columns = Mapping[str, np.ndarray]  # [seeds, iterations] each
 
 
 def weights(by_time: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
-    """Fig. 2: a bar for each policy's weight, oldest first; a panel for each time."""
+    """Draws Fig. 2: a bar for each policy's weight [n], oldest first; a panel for each time."""
     figure = Figure(figsize=(4 * len(by_time), 3.2), layout="constrained")
     for ax, (title, by_name) in zip(figure.subplots(1, len(by_time)), by_time.items(), strict=True):
         width = 0.8 / len(by_name)
@@ -50,8 +50,10 @@ def weights(by_time: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
 
 
 def classic_weights(found: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]]) -> Figure:
-    """Fig. 3, from `classic_weights.curves`: what the official code plots; its runs
-    beside the random policy from their starts; and fresh runs from rest.
+    """Draws Fig. 3 from `hazan_weights.curves` [seeds, rounds], with three panels per environment.
+
+    The first is what the official code plots. The second compares its runs with the random policy
+    from the same starts, and the third compares fresh runs from rest.
     """
     titles = {
         "running_entropy": "as published: running mean",
@@ -76,10 +78,10 @@ def classic_weights(found: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]])
 
 
 def curves(groups: Sequence[tuple[str, str, Columns]], title: str) -> Figure:
-    """Fig. 4: interquartile means with their intervals.
+    """Draws Fig. 4: interquartile means with their intervals.
 
-    Of one environment, a row for each quantity and a column for each axis. Of several, as in the
-    paper: a row for each environment, and a column for each quantity against env steps.
+    One environment has a row for each quantity and a column for each axis. Several environments are
+    drawn as in the paper: a row for each, and a column for each quantity over env steps.
     """
     envs = list(dict.fromkeys(env for env, _, _ in groups))
     several = len(envs) > 1
@@ -112,7 +114,7 @@ def curves(groups: Sequence[tuple[str, str, Columns]], title: str) -> Figure:
         for ax, (_, _, label, _) in zip(axes[0], panels[0], strict=True):
             ax.set_title(label)
     else:
-        for ax in axes[:, 0]:  # against iterations
+        for ax in axes[:, 0]:  # over iterations
             ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, frameon=False, ncols=6, loc="outside lower center")
@@ -126,11 +128,12 @@ def along(
     label: str,
     title: str,
 ) -> Figure:
-    """The last iteration against the number that the methods differ in; a row for each env.
+    """Draws the last iteration over the number in which the methods differ; a row for each env.
 
-    Interquartile means with their intervals, and every seed's value.
+    It shows interquartile means with their intervals, and every seed's value.
+
     Args:
-      places: by env and method; of others, as the random policy, there is a line.
+      places: the number, by env and method; a method without one, as the random policy, is a line.
     """
     envs = list(dict.fromkeys(env for env, _, _ in groups))
     figure = Figure(figsize=(13, 3.4 * len(envs)), layout="constrained")
@@ -159,7 +162,7 @@ def along(
 
 
 def occupancies(directories: Mapping[str, Path]) -> Figure:
-    """Fig. 5: a row for each method; log-occupancy in training and of the mixture, and paths."""
+    """Draws Fig. 5, a row per method: log-occupancy in training and of the mixture, and paths."""
     figure = Figure(figsize=(13, 4 * len(directories)), layout="constrained")
     axes = figure.subplots(len(directories), 3, squeeze=False)
     for row, (method, directory) in zip(axes, directories.items(), strict=True):
@@ -169,7 +172,7 @@ def occupancies(directories: Mapping[str, Path]) -> Figure:
         plotting.draw_occupancy(row[0], run, run.histogram / max(run.histogram.sum(), 1))
         plotting.draw_occupancy(row[1], run, cells)
         plotting.draw_paths(row[2], run, paths(visited))
-        for ax, what in zip(row, ("training", "mixture", "a policy a colour"), strict=True):
+        for ax, what in zip(row, ("training", "mixture", "one colour per policy"), strict=True):
             ax.set_title(f"{method}: {what}")
     return figure
 
@@ -203,9 +206,7 @@ def _band(
 
 
 def _styles(methods: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """By method: the same colour in every figure for those of the paper; once the others' are used
-    up, they come again, dashed.
-    """
+    """By method: fixed colours for those of the paper; the other colours repeat, dashed."""
     others = iter([(color, line) for line in ("-", "--") for color in OTHERS])
     chosen = {m: (COLORS[m], "-") if m in COLORS else next(others) for m in dict.fromkeys(methods)}
     return {m: {"color": color, "linestyle": line} for m, (color, line) in chosen.items()}

@@ -1,8 +1,8 @@
-"""Studies: the runs that an experiment is made of, and what is left of them to do.
+"""Studies: the runs that make up an experiment, and which of them are finished.
 
-A study is a list of cells, and a cell is a run as the command `train` makes them, in a directory of
-its own. All methods of a study have the same env steps and gradient steps, and are measured in the
-same projection. Loads no array library.
+A study is a list of cells. A cell is a run of the command `train` in its own directory. All methods
+of a study have the same env steps and gradient steps, and are measured in the same projection.
+Loads no array library.
 """
 
 import json
@@ -17,7 +17,7 @@ from maxent_jax.errors import UsageError
 from maxent_jax.runs import files, integrity, locks
 
 STUDY = "study.json"
-VERSION = 1  # of a study's directory
+VERSION = 1  # of the layout of a study's directory
 SCALES = ("toy", "cpu", "paper")
 ETAS = (0.1, 0.01, 0.001)
 
@@ -32,29 +32,29 @@ class Cell(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Of its directory."""
+        """The name of the cell's directory."""
         method = "".join(c if c.isalnum() or c in ".-" else "_" for c in self.method)
         first, last = self.config.seed, self.config.seed + self.config.num_seeds - 1
         return f"{self.config.env}-{method}-{first}" + (f"-{last}" if last > first else "")
 
 
 class Scale(NamedTuple):
-    """How much of a study is run."""
+    """The size of a study."""
 
     preset: str
     num_seeds: Mapping[str, int]  # by environment
-    changes: Mapping[str, Any] = MappingProxyType({})  # of the preset, in every cell
+    changes: Mapping[str, Any] = MappingProxyType({})  # to the preset, in every cell
 
 
 class Study(NamedTuple):
     """An experiment."""
 
     what: str
-    methods: dict[str, Changes]  # of the preset, by name in the figures
+    methods: dict[str, Changes]  # changes to the preset, by name in the figures
     scales: dict[str, Scale]
-    together: bool = False  # seeds side by side in one run, not each in its own
-    mepol: bool = False  # beside them, at the same env steps
-    along: str = ""  # the number that the methods differ in: see reproduced.ALONG
+    together: bool = False  # all seeds in one run, instead of one run per seed
+    mepol: bool = False  # also runs MEPOL, at the same env steps
+    along: str = ""  # the number in which the methods differ: see results.ALONG
 
 
 TOY = Scale("smoke", {"pendulum": 2})
@@ -63,19 +63,19 @@ ROBOT = {
     "cpu": Scale("quick", {"ant": 3}),
     "paper": Scale("paper", {"ant": 5}),
 }
-CLASSIC = {  # on two cores an iteration of ten seeds takes minutes: two of them, in one environment
+CLASSIC = {  # on two cores an iteration of ten seeds takes minutes, so "cpu" is small
     "toy": TOY,
     "cpu": Scale("quick", {"pendulum": 10}, {"num_iterations": 2}),
     "paper": Scale("paper", dict.fromkeys(CLASSIC_ENVS, 10)),
 }
 THREE: dict[str, Changes] = {
-    "H": {"method": "h", "random_baseline": True},  # raw.read takes the first method's
+    "H": {"method": "h", "random_baseline": True},  # values.read takes the first method's
     "LA": {"method": "la"},
     "V": {"method": "v"},
 }
-# Ablations of what an iteration does, not of what the iterations add up to, end after four of them.
+# Ablations of what happens within an iteration need only four iterations.
 ABLATION = ROBOT | {"cpu": Scale("quick", {"ant": 3}, {"num_iterations": 4})}
-# A method's own choice is left to the method: see `home`.
+# A method's own period is not set again, so that equal runs have equal configs: see `home`.
 REFRESHED: dict[str, Changes] = {
     "every 1": {"method": "la"},
     **{
@@ -86,7 +86,7 @@ REFRESHED: dict[str, Changes] = {
 
 STUDIES: dict[str, Study] = {
     "fig4": Study(
-        "H, LA and V, beside a random policy",
+        "H, LA and V, with a random policy",
         THREE,
         {
             "toy": TOY,
@@ -95,7 +95,7 @@ STUDIES: dict[str, Study] = {
         },
     ),
     "weights": Study(
-        "weights of the mixture; all else is V's",
+        "V with other weights of the mixture",
         {
             "uniform": {},
             **{f"η = {eta}": {"weights": "geometric", "eta": eta} for eta in ETAS},
@@ -130,12 +130,12 @@ STUDIES: dict[str, Study] = {
         ABLATION,
     ),
     "stale": Study(
-        "stored rewards, of the current reference or of their time",
+        "stored rewards: recomputed for the current reference, or stale",
         {"recomputed": {}, "stale": {"stale_rewards": True}},
         ABLATION,
     ),
     "termination": Study(
-        "what ends an episode",
+        "conditions that end an episode",
         {
             "health and flips": {"end_flipped": True},
             "health": {"end_flipped": False},
@@ -144,7 +144,7 @@ STUDIES: dict[str, Study] = {
         ABLATION | {"toy": TOY._replace(num_seeds={"ant": 2})},
     ),
     "published": Study(
-        "H and LA as published, and as the paper reads them, all with one plain learner",
+        "H and LA as published and as the paper reads them, with the same plain learner",
         {
             **{name: changes | PLAIN for name, changes in THREE.items()},
             "H, official": {"method": "h-official"},
@@ -153,7 +153,7 @@ STUDIES: dict[str, Study] = {
         ABLATION,
     ),
     "baselines": Study(
-        "rewards that the field compares with, one policy each, and V",
+        "baselines with one policy each, and V",
         {"V": {"method": "v"} | PLAIN, **{name: {"method": name} for name in BASELINES}},
         CLASSIC,
         together=True,
@@ -163,7 +163,7 @@ STUDIES: dict[str, Study] = {
 
 
 def make(study: str, scale: str, num_seeds: int | None = None) -> list[Cell]:
-    """The cells of a study at a scale, all methods of a seed before the next seed."""
+    """Returns the cells of a study at a scale: all methods of a seed, then the next seed."""
     chosen = STUDIES[study]
     at = chosen.scales[scale]
     seeds = at.num_seeds if num_seeds is None else dict.fromkeys(at.num_seeds, num_seeds)
@@ -184,10 +184,11 @@ def make(study: str, scale: str, num_seeds: int | None = None) -> list[Cell]:
 
 
 def claim(directory: Path, study: str, scale: str, cells: list[Cell]) -> None:
-    """Makes the study's directory, or sees that it is this study's; more seeds may be added.
+    """Makes the study's directory, or checks that it belongs to this study; seeds may be added.
 
     Raises:
-      UsageError: it holds another study, or this one with other settings, or cannot be written.
+      UsageError: the directory holds another study, or this one with other settings, or cannot be
+        written.
     """
     content = files.jsonable(
         {
@@ -215,7 +216,7 @@ def _claim(directory: Path, content: Changes) -> None:
         if content == held:
             return
     elif not locks.is_free(directory, STUDY):
-        raise UsageError(f"{directory} is no study's, and not empty: choose another --out.")
+        raise UsageError(f"{directory} is not a study's, and not empty: choose another --out.")
     files.write_json(path, content)
 
 
@@ -234,8 +235,10 @@ def _difference(held: Changes, asked: Changes) -> str:
 
 
 def home(directory: Path, cell: Cell) -> Path:
-    """The directory of the cell's run: its own, or, where it has none yet, that of an equal run of
-    this study or one beside it, under whatever name.
+    """Returns the directory of the cell's run.
+
+    If the cell has no directory yet, this may be that of an equal run, of this study or of another
+    in the same folder, under any name.
     """
     own = directory / cell.name
     if not own.exists():
@@ -256,10 +259,10 @@ def _cells(study: Path) -> dict[str, Changes]:
 
 
 def finished(directory: Path, cell: Cell) -> bool:
-    """Whether the cell's run is complete and saved.
+    """Tells whether the cell's run is complete and saved.
 
     Raises:
-      RunError: what is saved there is a run with other settings.
+      RunError: the directory holds a run with other settings.
     """
     at = home(directory, cell)
     if integrity.checkpoints(at)[-1:] != [f"{cell.config.budget.num_iterations}"]:

@@ -1,4 +1,4 @@
-"""From finished studies to figures, tables and summaries."""
+"""Makes figures, tables and summaries of finished studies."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -28,7 +28,7 @@ SUMMARISED = (
     *("mixture_coverage", "mixture_entropy", "mixture_knn_entropy"),
 )
 
-# What a study's methods may differ in as a number: its name in the figure, and its value.
+# Numbers in which a study's methods may differ: the name in the figure, and the value.
 ALONG: dict[str, tuple[str, Callable[[Config], float]]] = {
     "refresh_period": (
         "env steps between refreshes",
@@ -48,9 +48,9 @@ def draw(
     out: Path,
     studies: Mapping[str, Sequence[Cell]],
 ) -> None:
-    """Figures and studies by name, into directories of theirs; prints each file and table."""
+    """Draws figures and studies by name, each in its own directory; prints files and tables."""
     for what in whats:
-        with locks.holding(out / what):  # of processes that share it, one at a time
+        with locks.holding(out / what):  # processes that share it take turns
             if what == "fig2":
                 fig2(out / "fig2")
             elif what == "fig3":
@@ -62,7 +62,7 @@ def draw(
 
 
 def fig2(directory: Path) -> None:
-    """The mixture's weights, exactly."""
+    """Draws Fig. 2: the mixture's exact weights."""
     weights = {
         f"t = {time}": {"uniform": mixture.uniform_weights(time)}
         | {f"η = {eta}": mixture.geometric_weights(time, eta) for eta in protocol.ETAS}
@@ -74,7 +74,7 @@ def fig2(directory: Path) -> None:
 
 
 def fig3(directory: Path, scale: str, num_seeds: int | None) -> None:
-    """Weights in the classic environments with the official settings; Ant's are a study."""
+    """Draws Fig. 3: weights in the classic environments with the official settings."""
     found = hazan_weights.results(directory, scale, num_seeds)
     table = hazan_weights.table(found)
     files.write_json(directory / "summary.json", dict(table))
@@ -84,7 +84,7 @@ def fig3(directory: Path, scale: str, num_seeds: int | None) -> None:
 
 
 def study(directory: Path, name: str, cells: Sequence[Cell]) -> None:
-    """raw.csv, summary.json and the curves of a study, and its table."""
+    """Writes a study's raw.csv, summary.json and curves, and prints its table."""
     rows = values.read(directory, cells)
     if protocol.STUDIES[name].mepol:
         ours = [cell for cell in cells if cell.method == cells[0].method]
@@ -107,12 +107,12 @@ def study(directory: Path, name: str, cells: Sequence[Cell]) -> None:
     for env, table in summary["last_iteration"].items():
         _print(summary["compared_with"], {f"{env}, {measure}": table[measure] for measure in table})
     if len(summary["versions"]) > 1:
-        print(f"note: the runs were made with {len(summary['versions'])} sets of versions.")
+        print(f"note: the runs used {len(summary['versions'])} different sets of versions.")
     print(f"{directory / 'raw.csv'}, {directory / 'summary.json'}")
 
 
 def fig5(directory: Path, trained: Path, cells: Sequence[Cell]) -> None:
-    """Where the first seed of each method went: in training, by the mixture, and each policy."""
+    """Draws Fig. 5: the occupancy of each method's first seed, in training and of the mixture."""
     for env in dict.fromkeys(cell.config.env for cell in cells):
         chosen = [c for c in cells if c.config.env == env and c.config.seed == 0]
         figure = paper_figures.occupancies({c.method: protocol.home(trained, c) for c in chosen})
@@ -120,8 +120,13 @@ def fig5(directory: Path, trained: Path, cells: Sequence[Cell]) -> None:
 
 
 def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[str, Any]:
-    """The last iteration of each environment: interquartile means, intervals, and how likely V, or
-    the first method, is to be better than each other; and that in all environments together.
+    """Summarises the last iteration of each environment, and of all environments together.
+
+    The summary has interquartile means, intervals, and the probability that V (or else the first
+    method) is better than each other method.
+
+    Args:
+      groups: environment, method and columns [N, T], as from `values.groups`.
     """
     envs = sorted({env for env, _, _ in groups})
     names = list(dict.fromkeys(method for _, method, _ in groups))
@@ -137,7 +142,7 @@ def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[
         }
         for env in envs
     }
-    everywhere = {  # where that says more than the one environment does
+    everywhere = {  # only if there are several environments
         name: statistics.improvements(
             {
                 method: [last[env][name][method] for env in envs]
@@ -160,7 +165,7 @@ def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[
 
 
 def _versions(directory: Path, cells: Sequence[Cell]) -> list[dict[str, str]]:
-    """The stacks that made the runs, each once."""
+    """The different sets of versions that made the runs."""
     of_cells = [files.read_versions(protocol.home(directory, cell)) for cell in cells]
     return [v for i, v in enumerate(of_cells) if v not in of_cells[:i]]
 

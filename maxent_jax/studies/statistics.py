@@ -1,7 +1,9 @@
-"""What a few seeds say: interquartile mean, stratified bootstrap, probability of improvement.
+"""Statistics of a few seeds: interquartile mean, bootstrap interval, probability of improvement.
 
-After Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice",
-arXiv 2108.13264. Scores are lists of arrays, one array of seeds for each task.
+Scores are lists of arrays: for each task one array with an entry per seed.
+
+Source: Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice",
+arXiv 2108.13264.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -13,25 +15,25 @@ from scipy import stats
 Scores = Sequence[np.ndarray]
 RESAMPLES = 2000
 CONFIDENCE = 0.95
-EXACT: Final = "inverted_cdf"  # percentiles are values that were found: none lies beside -inf
+EXACT: Final = "inverted_cdf"  # takes values that occur; interpolation would fail at -inf
 
 
 def interquartile_mean(scores: Scores) -> np.ndarray:
-    """The mean of the middle half of all runs of all tasks, which have one unit.
+    """Returns the mean of the middle half of all runs of all tasks, over the last axis.
 
-    It is taken over the last axis. From four runs on no single one can move it far; of three it is
-    their mean.
+    All tasks have the same unit. With four or more runs a single run cannot move it far; with three
+    it is their mean.
     """
     return stats.trim_mean(np.concatenate(scores, axis=-1), 0.25, axis=-1)
 
 
 def probability_of_improvement(ours: Scores, theirs: Scores) -> np.ndarray:
-    """How likely a run of ours is to beat one of theirs on the same task, ties counted half.
+    """Returns the probability that a run of ours beats one of theirs on the same task.
 
-    The runs lie along the last axis.
+    Ties count half. Runs are along the last axis.
 
     Raises:
-      ValueError: different numbers of tasks.
+      ValueError: the numbers of tasks differ.
     """
     pairs = ((x[..., :, None], y[..., None, :]) for x, y in zip(ours, theirs, strict=True))
     of_tasks = [np.mean((x > y) + 0.5 * (x == y), axis=(-2, -1)) for x, y in pairs]
@@ -44,19 +46,20 @@ def interval(
     seed: int = 0,
     resamples: int = RESAMPLES,
 ) -> tuple[float, float]:
-    """The 95 % percentile interval of a statistic by stratified bootstrap.
+    """Returns the 95 % percentile interval of a statistic by stratified bootstrap.
 
-    The seeds of each task, of each of the scores, are drawn anew with replacement; tasks stay.
+    The seeds of each task are resampled with replacement, separately in each of the scores. The
+    tasks stay the same.
 
     Args:
-      statistic: of as many scores as are given, over the last axis of arrays [resamples, seeds].
-      scores: not empty. With one seed a task the interval is a point, and says nothing; with
-        three it holds the mean of normal values three times in four.
+      statistic: a function of the scores, over the last axis of arrays [resamples, seeds].
+      scores: not empty. With one seed per task the interval is a point and meaningless; with three
+        it contains the mean of normal values three times in four.
     Raises:
-      ValueError: a task without seeds.
+      ValueError: a task has no seeds.
     """
     if any(len(of_task) == 0 for some in scores for of_task in some):
-        raise ValueError("each task needs at least one seed")
+        raise ValueError("a task has no seeds, but needs at least one")
     random = np.random.default_rng(seed)
     found = statistic(
         *([x[random.integers(len(x), size=(resamples, len(x)))] for x in some] for some in scores)
@@ -66,9 +69,9 @@ def interval(
 
 
 def interval_of_curves(curves: np.ndarray, seed: int = 0) -> tuple[np.ndarray, ...]:
-    """Interquartile mean of curves [N, T] at each time, and its interval: three arrays [T].
+    """Returns the interquartile mean of curves [N, T] and the ends of its interval, [T] each.
 
-    Whole curves are drawn, so that neighbouring times rise and fall together.
+    The bootstrap resamples whole curves, which keeps the correlation of neighbouring times.
     """
     random = np.random.default_rng(seed)
     rows = random.integers(len(curves), size=(RESAMPLES, len(curves)))
@@ -77,8 +80,13 @@ def interval_of_curves(curves: np.ndarray, seed: int = 0) -> tuple[np.ndarray, .
 
 
 def compare(scores: Mapping[str, np.ndarray], ours: str) -> dict[str, dict[str, Any]]:
-    """Methods on one task, an array of seeds each: interquartile mean and interval and, but for
-    `ours` itself, how likely that is to be better.
+    """Returns each method's interquartile mean and interval on one task, and compares with `ours`.
+
+    The comparison is the probability that `ours` is better than the method.
+
+    Args:
+      scores: by method, [N] one value for each seed.
+      ours: one of the methods.
     """
     found = {
         name: {
@@ -93,7 +101,7 @@ def compare(scores: Mapping[str, np.ndarray], ours: str) -> dict[str, dict[str, 
 
 
 def improvements(scores: Mapping[str, Scores], ours: str) -> dict[str, dict[str, Any]]:
-    """By each other name: how likely `ours` is to be better, on all tasks, with its interval."""
+    """Returns the probability that `ours` is better than each other method, with its interval."""
     return {
         name: {
             "probability_of_improvement": float(probability_of_improvement(scores[ours], theirs)),
@@ -105,6 +113,6 @@ def improvements(scores: Mapping[str, Scores], ours: str) -> dict[str, dict[str,
 
 
 def _percentiles(found: np.ndarray) -> np.ndarray:
-    """The two ends of what resamples [N, ...] found."""
+    """The two ends of the interval of resampled values [N, ...]."""
     outside = 50 * (1 - CONFIDENCE)
     return np.percentile(found, [outside, 100 - outside], axis=0, method=EXACT)

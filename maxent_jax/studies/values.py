@@ -1,4 +1,4 @@
-"""The raw values of a study's runs: a row for each seed and iteration, and CSV files of them."""
+"""The raw values of a study's runs: a row for each seed and iteration, and their CSV files."""
 
 import csv
 import math
@@ -25,7 +25,7 @@ Row = dict[str, Any]
 
 
 def read(directory: Path, cells: Sequence[Cell]) -> list[Row]:
-    """Of all cells, and of the random policy beside the first method's runs."""
+    """Reads the rows of all cells, and of the random baseline in the first method's runs."""
     found = []
     first = cells[0].method
     for cell in cells:
@@ -41,17 +41,17 @@ def read(directory: Path, cells: Sequence[Cell]) -> list[Row]:
 
 
 def known(row: Row) -> Row:
-    """What the columns ask for, of a row that was kept as JSON.
+    """Picks the columns from a row that was stored as JSON.
 
-    That knows no infinity, and of the measures a single one can leave the finite numbers, to one
-    side: where states coincide, their entropy in features is -inf.
+    JSON has no infinity and stores null. The only measure that can be infinite is the entropy in
+    feature space, which is -inf if states coincide.
     """
     own = {name: row[name] for name in COLUMNS if name in row}
     return {name: -math.inf if value is None else value for name, value in own.items()}
 
 
 def write(path: Path, rows: Sequence[Row]) -> None:
-    """As CSV, whole or not at all."""
+    """Writes a CSV file, completely or not at all."""
     with (
         files.whole_file(path) as temporary,
         open(temporary, "w", encoding="utf-8", newline="") as file,
@@ -62,7 +62,7 @@ def write(path: Path, rows: Sequence[Row]) -> None:
 
 
 def groups(rows: Sequence[Row]) -> Iterator[tuple[str, str, dict[str, np.ndarray]]]:
-    """Environment, method, and columns [seeds, iterations] of what every row of theirs has."""
+    """Yields environment, method, and the columns that all their rows have [seeds, iterations]."""
     names = dict.fromkeys((row["env"], row["method"]) for row in rows)
     for env, method in names:
         own = [row for row in rows if (row["env"], row["method"]) == (env, method)]
@@ -77,7 +77,7 @@ def groups(rows: Sequence[Row]) -> Iterator[tuple[str, str, dict[str, np.ndarray
 
 
 def _of_random(row: Row) -> Row:
-    """What the random policy beside a run reached."""
+    """The coverage and entropy of a run's random baseline."""
     kept = {name: row[name] for name in ("iteration", "env_steps", "wall_seconds")}
     reached = {f"cumulative_{name}": row[f"random_{name}"] for name in MEASURED}
     return {"method": RANDOM, "gradient_steps": 0} | kept | reached

@@ -1,1 +1,1 @@
-"""The theory, executable: bounds, and exact experiments in tabular MDPs."""
+"""The theory in code: bounds, and exact experiments in tabular MDPs."""

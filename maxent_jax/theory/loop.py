@@ -1,9 +1,9 @@
-"""MaxEnt-H, LA and V in a tabular MDP: the rows of `methods.py`, with exact oracles.
+"""MaxEnt-H, LA and V in a tabular MDP: the rows of `config.registry.METHODS`, with exact oracles.
 
-An iteration is Algorithm 1's: the mixture's occupancy defines the reward (the gradient of H_σ), a
-planner starts from some values and makes so many backups, and its greedy policy is archived. A
-*planning step*, one backup of all states, stands for a step of training: with few of them the
-planner is what a learner is before it has converged.
+An iteration is that of Algorithm 1. The mixture's occupancy defines the reward (the gradient of
+H_σ), a planner makes a number of backups from its initial values, and its greedy policy is
+archived. A *planning step*, one backup of all states, stands for a step of training: a planner with
+few of them is like a learner that has not converged.
 """
 
 import functools
@@ -21,37 +21,39 @@ from maxent_jax.theory.mdps import Mdp
 
 
 class Settings(NamedTuple):
-    """Of a run, beside its method."""
+    """Settings of a run, in addition to its method."""
 
-    num_iterations: int  # T: policies beside the first
+    num_iterations: int  # T: policies after the first
     planning_steps: int  # in an iteration
     smoothing: float  # σ
-    eta: float = 0.1  # η, of weights that have one
-    density_noise: float = 0.0  # ε₀: every state's density is off by so much, at random up or down
-    planning_noise: float = 0.0  # ε₁: so much value is lost, towards the worst policy, nats
+    eta: float = 0.1  # η, for weights that use it
+    density_noise: float = 0.0  # ε₀: error of every state's density, randomly up or down
+    planning_noise: float = 0.0  # ε₁: value that the planner loses, towards the worst policy, nats
 
 
 class Trace(NamedTuple):
-    """What a run went through, for each of N seeds. P = T + 1 mixtures, the first of one policy."""
+    """The measures of a run for N seeds and P = T + 1 mixtures, the first of one policy."""
 
     objective: np.ndarray  # [N, P] H_σ of the mixture, nats
     entropy: np.ndarray  # [N, P] of the mixture, without smoothing
-    history_objective: np.ndarray  # [N, P] H_σ of all that was done; only where it is the reference
+    history_objective: np.ndarray  # [N, P] H_σ of the history; NaN where it is not the reference
     density_error: np.ndarray  # [N, T] largest difference of a density from the mixture's
     planning_error: np.ndarray  # [N, T] bounds the value lost under the last reward, nats
-    mixture: np.ndarray  # [N, S] the last
+    mixture: np.ndarray  # [N, S] occupancy of the last mixture
 
 
 def recursive_weights(n: int, eta: float) -> np.ndarray:
-    """[n] those of Hazan et al. 2019, Algorithm 1: the newest gets η, all others shrink by 1 - η.
+    """Returns weights [n] by which the newest policy gets η, and the others shrink by 1 - η.
 
-    To these the bound applies; `mixture.geometric_weights` are those of the official code.
+    The bound holds for these; `mixture.geometric_weights` are those of the official code.
+
+    Source: Hazan et al. 2019, Algorithm 1.
     """
     return np.where(np.arange(n) > 0, eta, 1.0) * (1 - eta) ** np.arange(n - 1, -1, -1)
 
 
 def linear_weights(n: int) -> np.ndarray:
-    """[n] Frank-Wolfe's with step 2/(t + 2), the oldest policy least: in proportion to 1 ... n."""
+    """Returns Frank-Wolfe weights [n] for step 2/(t + 2): proportional to 1 ... n, oldest first."""
     return np.arange(1, n + 1) / (n * (n + 1) / 2)
 
 
@@ -64,18 +66,21 @@ WEIGHTS: dict[str, Callable[[int, float], np.ndarray]] = {
 
 
 def run(mdp: Mdp, row: MethodRow, settings: Settings, first: np.ndarray, keys: jax.Array) -> Trace:
-    """The method from several first policies side by side.
+    """Runs a method from several first policies in parallel.
 
     Args:
       mdp: one for all seeds, or one for each, with a leading axis [N] (mdps.stack).
-      row: a row of config.registry.METHODS. A refresh period counts planning steps. The history
-        is the mean occupancy of the agent's greedy policies, one after each planning step, and of
-        the first policy; the weights may be any of WEIGHTS.
+      row: a row of config.registry.METHODS. Its refresh period counts planning steps, and its
+        weights may be any of WEIGHTS. The history is the mean occupancy of the first policy and of
+        the agent's greedy policy after each planning step.
       settings: of the run.
       first: [N, L, S, A] π_0 of each seed.
-      keys: [N] for the noise.
+      keys: [N] typed keys for the noise.
+    Returns:
+      The trace of all seeds.
     Raises:
-      ValueError: sizes below 1, a smoothing that is not positive, negative noise, or unknown words.
+      ValueError: a size is below 1, the smoothing is not positive, a noise is negative, or the row
+        holds an unknown word.
     """
     _check(row, settings)
     capacity = settings.num_iterations + 1
@@ -105,7 +110,7 @@ def run(mdp: Mdp, row: MethodRow, settings: Settings, first: np.ndarray, keys: j
 
 
 class _Shape(NamedTuple):
-    """What a program is compiled for."""
+    """What the compiled program depends on."""
 
     num_iterations: int
     planning_steps: int
@@ -207,7 +212,7 @@ def _train(mdp, numbers, shape, agent, refreshed):
     period = numbers.refresh_period
 
     def step(i, agent):
-        if shape.keeps_history:  # a mixture does not change within an iteration
+        if shape.keeps_history:  # the mixture does not change within an iteration
             due = (period > 0) & (i % jnp.maximum(period, 1) == 0)
             agent = jax.tree.map(lambda a, b: jnp.where(due, a, b), refreshed(agent), agent)
         agent = agent._replace(values=tabular.plan(mdp, agent.reward, agent.values, 1))
@@ -217,14 +222,14 @@ def _train(mdp, numbers, shape, agent, refreshed):
 
 
 def _visit(mdp, agent):
-    """With what its policy does added to the history."""
+    """Adds the occupancy of the agent's policy to its history."""
     occupied = tabular.greedy_occupancy(mdp, agent.reward, agent.values)
     change = (occupied - agent.history) / (agent.age + 1)
     return agent._replace(history=agent.history + change, age=agent.age + 1)
 
 
 def _next_occupancy(mdp, numbers, shape, agent):
-    """The occupancy to archive, and a bound of the value that it loses under the last reward."""
+    """The occupancy to archive, and a bound on the value that it loses under the last reward."""
     best = tabular.greedy_occupancy(mdp, agent.reward, agent.values)
     lost = tabular.planning_loss(mdp, agent.reward, agent.values)
     if not shape.plans_badly:
@@ -247,4 +252,6 @@ def _check(row: MethodRow, settings: Settings) -> None:
     known = {"weights": WEIGHTS, "reference": ("mixture", "history"), "start": STARTS}
     for name, words in known.items():
         if getattr(row, name) not in words:
-            raise ValueError(f"unknown {name} '{getattr(row, name)}': choose of {', '.join(words)}")
+            raise ValueError(
+                f"unknown {name} '{getattr(row, name)}': choose from {', '.join(words)}"
+            )

@@ -1,12 +1,12 @@
-"""Tabular MDPs without reward: a user's own, and those known from the literature. NumPy alone."""
+"""Tabular MDPs without reward: a user's own, and some from the literature. Needs only NumPy."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-Array = Any  # NumPy's, or jax's once it is on a device
-ROUNDING = 1e-9  # of probabilities that should sum to one
+Array = Any  # of NumPy, or of jax after `tabular.on_device`
+ROUNDING = 1e-9  # tolerance for probabilities that should sum to one
 
 
 class Dynamics(NamedTuple):
@@ -17,25 +17,25 @@ class Dynamics(NamedTuple):
 
 
 class Mdp(NamedTuple):
-    """Dynamics with a way to count time, in the form that the computations want.
+    """Dynamics with a way to count time, in the form that the computations use.
 
-    Policies and values have an axis of L layers in front: one for a discounted MDP, whose best
-    policies are stationary, and one a step for a finite horizon. An episode begins in layer 0, and
-    after a step in layer l it goes on in `next_layer[l]` with probability `discount[l]`.
+    Policies and values have a leading axis of L layers: one layer for a discounted MDP, whose best
+    policies are stationary, and one layer per step for a finite horizon. An episode begins in layer
+    0. After a step in layer l it continues in `next_layer[l]` with probability `discount[l]`.
     """
 
     successors: Array  # [S, A, N] int32, the states that may follow
-    probabilities: Array  # [S, A, N] float64, of each; 0 fills up
+    probabilities: Array  # [S, A, N] float64, of each successor; 0 for padding
     start: Array  # [S] float64
     next_layer: Array  # [L] int32
     discount: Array  # [L] float64
 
 
 def discounted(dynamics: Dynamics, discount: float) -> Mdp:
-    """With occupancy d(s) = (1 - γ) Σ_t γ^t P(s_t = s), which sums to one.
+    """Makes a discounted MDP; its occupancy is d(s) = (1 - γ) Σ_t γ^t P(s_t = s), of sum 1.
 
     Raises:
-      ValueError: γ outside [0, 1), or dynamics that are no probabilities.
+      ValueError: γ is outside [0, 1), or the dynamics are not probabilities.
     """
     if not 0 <= discount < 1:
         raise ValueError(f"discount is {discount}, but must be in [0, 1)")
@@ -43,10 +43,12 @@ def discounted(dynamics: Dynamics, discount: float) -> Mdp:
 
 
 def finite_horizon(dynamics: Dynamics, horizon: int) -> Mdp:
-    """With occupancy d(s) = (1/H) Σ_{t < H} P(s_t = s), and policies that depend on t.
+    """Makes an MDP of horizon H with occupancy d(s) = (1/H) Σ_{t < H} P(s_t = s).
+
+    Its policies depend on t.
 
     Raises:
-      ValueError: H < 1, or dynamics that are no probabilities.
+      ValueError: H < 1, or the dynamics are not probabilities.
     """
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}, but must be at least 1")
@@ -55,12 +57,13 @@ def finite_horizon(dynamics: Dynamics, horizon: int) -> Mdp:
 
 
 def garnet(num_states: int, num_actions: int, branching: int, seed: int) -> Dynamics:
-    """A random MDP: each action leads to `branching` states, with random probabilities.
+    """Makes a random MDP: each action leads to `branching` states with random probabilities.
 
-    Begins in state 0. Source: Archibald, McKinnon & Thomas 1995.
+    It begins in state 0.
 
     Raises:
-      ValueError: a size below 1, or branching above num_states.
+      ValueError: a size is below 1, or branching is above num_states.
+    Source: Archibald, McKinnon & Thomas 1995.
     """
     sizes = {"num_states": num_states, "num_actions": num_actions, "branching": branching}
     for name, size in sizes.items():
@@ -79,12 +82,13 @@ def garnet(num_states: int, num_actions: int, branching: int, seed: int) -> Dyna
 
 
 def double_chain(length: int = 31, failure: float = 0.1) -> Dynamics:
-    """A chain that begins in its middle; left and right, the other one where an action fails.
+    """Makes a chain that begins in its middle.
 
-    Source: Kaufmann et al. 2021; Tiapkin et al. 2023 take these values and a horizon of 20.
+    The actions are left and right; one that fails moves in the other direction.
 
     Raises:
-      ValueError: length < 2 or failure outside [0, 1].
+      ValueError: length < 2, or failure outside [0, 1].
+    Source: Kaufmann et al. 2021. Tiapkin et al. 2023 use these values and a horizon of 20.
     """
     _check_length(length)
     _check_probability("failure", failure)
@@ -98,12 +102,11 @@ def double_chain(length: int = 31, failure: float = 0.1) -> Dynamics:
 
 
 def river_swim(length: int = 6) -> Dynamics:
-    """A chain against the current: left always succeeds, right rarely. Begins at the left end.
-
-    Source: Strehl & Littman 2008, with the probabilities that are in common use since.
+    """Makes a chain with a current: left always succeeds, right rarely. It begins at the left end.
 
     Raises:
       ValueError: length < 2.
+    Source: Strehl & Littman 2008, with the probabilities that have been in common use since.
     """
     _check_length(length)
     left, right = 0, 1
@@ -118,27 +121,27 @@ def river_swim(length: int = 6) -> Dynamics:
 
 
 def open_grid(size: int = 21, success: float = 0.95) -> Dynamics:
-    """A square without walls that begins in its centre.
+    """Makes a square without walls; episodes begin in its centre.
 
-    The four actions move by a cell; with probability 1 - success the move goes to one of the other
-    neighbours, each equally likely. A move out of the square stays where it is.
-
-    Source: the code published with Tiapkin et al. 2023, which takes these values, a horizon of 20,
-    and no walls.
+    Each of the four actions moves by one cell. With probability 1 - success the move goes to one of
+    the other neighbours, each equally likely. A move out of the square has no effect.
 
     Raises:
-      ValueError: size < 2 or success outside [0, 1].
+      ValueError: size < 2, or success outside [0, 1].
+    Source: the code published with Tiapkin et al. 2023, which uses these values, a horizon of 20,
+    and no walls.
     """
     _check_length(size)
     return _grid(np.ones((size, size), bool), (size // 2, size // 2), success)
 
 
 def four_rooms(size: int = 21, success: float = 0.95) -> Dynamics:
-    """The same square with a wall along its middle row and column, and a door in each of the four
-    pieces; it begins in the centre of the first room.
+    """Makes the square of `open_grid` with walls along its middle row and column.
+
+    Each of the four pieces of wall has a door. Episodes begin in the centre of the first room.
 
     Raises:
-      ValueError: size even or below 5, or success outside [0, 1].
+      ValueError: size is even or below 5, or success is outside [0, 1].
     """
     if size < 5 or size % 2 == 0:
         raise ValueError(f"size is {size}, but must be odd and at least 5")
@@ -152,7 +155,7 @@ def four_rooms(size: int = 21, success: float = 0.95) -> Dynamics:
 
 def _grid(free: np.ndarray, start: tuple[int, int], success: float) -> Dynamics:
     _check_probability("success", success)
-    index = np.full(np.add(free.shape, 2), -1)  # a border all round
+    index = np.full(np.add(free.shape, 2), -1)  # with a border
     index[1:-1, 1:-1][free] = np.arange(free.sum())
     rows, columns = np.nonzero(free)
     moves = ((0, -1), (0, 1), (-1, 0), (1, 0))
@@ -195,7 +198,7 @@ def _check(transitions: np.ndarray, start: np.ndarray) -> None:
         raise ValueError(f"start has shape {start.shape}, but there are {len(transitions)} states")
     for name, rows in (("a row of transitions", transitions), ("start", start)):
         off = np.abs(rows.sum(-1) - 1)
-        if not ((rows >= 0).all() and (off <= ROUNDING).all()):  # not a number fails too
+        if not ((rows >= 0).all() and (off <= ROUNDING).all()):  # NaN fails too
             raise ValueError(f"{name} must be 0 or more and sum to one, not to 1 ± {off.max():.3g}")
 
 
@@ -205,7 +208,7 @@ def _point(num_states: int, state: int) -> np.ndarray:
 
 def _check_length(length: int) -> None:
     if length < 2:
-        raise ValueError(f"a side of {length} states is too short: at least 2")
+        raise ValueError(f"a side of {length} states is too short: at least 2 are needed")
 
 
 def _check_probability(name: str, value: float) -> None:
@@ -214,12 +217,12 @@ def _check_probability(name: str, value: float) -> None:
 
 
 def stack(mdps: Sequence[Mdp]) -> Mdp:
-    """MDPs of one shape with a leading axis in front of each field.
+    """Stacks MDPs of the same shape: each field gets a leading axis [N].
 
     Raises:
-      ValueError: none, or of different shapes.
+      ValueError: there are none, or their shapes differ.
     """
     shapes = {tuple(field.shape for field in mdp) for mdp in mdps}
     if len(shapes) != 1:
-        raise ValueError(f"{len(mdps)} MDPs of {len(shapes)} shapes can't be stacked")
+        raise ValueError(f"{len(mdps)} MDPs of {len(shapes)} shapes cannot be stacked")
     return Mdp(*(np.stack(fields) for fields in zip(*mdps, strict=True)))

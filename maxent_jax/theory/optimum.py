@@ -1,4 +1,4 @@
-"""The largest smoothed entropy that any policy of a tabular MDP has, with a proof of how near."""
+"""The largest smoothed entropy of any policy of a tabular MDP, with a certified accuracy."""
 
 import functools
 from typing import NamedTuple
@@ -11,29 +11,27 @@ from scipy import optimize, sparse
 from maxent_jax.theory import tabular
 from maxent_jax.theory.mdps import Mdp
 
-# Scale of the objective and the solver's tolerances, tried in this order: none suits all MDPs.
+# Scales of the objective and tolerances of the solver, in the order of trial: none suits all MDPs.
 ATTEMPTS = ((1e4, 1e-10), (1e3, 1e-12), (1e4, 1e-12), (1e2, 1e-13))
 MAX_STEPS = 500
 
 
 class OptimumError(RuntimeError):
-    """The solver did not come as near to the optimum as was asked."""
+    """The solver did not reach the tolerance."""
 
 
 class _Problem(NamedTuple):
-    """The unknowns are the occupancies of the U pairs of a state that can be visited and an action,
-    in their layers.
-    """
+    """The unknowns are the occupancies of U triples: a layer, a reachable state and an action."""
 
-    flow: sparse.csr_array  # [V, U] out of a layer's state less into it
-    begun: np.ndarray  # [V] is where episodes begin
+    flow: sparse.csr_array  # [V, U] out of a layer's state minus into it
+    begun: np.ndarray  # [V] where episodes begin
     total: sparse.csr_array  # [S, U] to the states
     first: np.ndarray  # [U] of the uniform policy
-    visited: np.ndarray  # [L, S, A] bool, with U that are true
+    visited: np.ndarray  # [L, S, A] bool, U of them true
 
 
 class Optimum(NamedTuple):
-    """A policy, and how much better any other can be."""
+    """A policy, and by how much any other can be better."""
 
     policy: np.ndarray  # [L, S, A]
     occupancy: np.ndarray  # [S]
@@ -42,19 +40,21 @@ class Optimum(NamedTuple):
 
 
 def solve(mdp: Mdp, smoothing: float, tolerance: float = 1e-8) -> Optimum:
-    """The optimum of H_σ by convex optimisation over occupancies, with SciPy's trust-constr.
+    """Finds the optimum of H_σ by convex optimisation over occupancies (SciPy's trust-constr).
 
-    Occupancies x(l, s, a) >= 0 form a polytope: what enters a state leaves it. H_σ is concave on
-    it. The solver's point is turned into a policy, whose exact occupancy d then counts. Since H_σ
-    is concave, no policy's exceeds that of d by more than max_π <d_π - d, ∇H_σ(d)>, which planning
-    bounds: the duality gap is certain whatever the solver did.
+    Occupancies x(l, s, a) >= 0 form a polytope: the flow into a state equals the flow out of it.
+    H_σ is concave on it. The solver's point is turned into a policy with exact occupancy d. As H_σ
+    is concave, no policy's H_σ exceeds that of d by more than max_π <d_π - d, ∇H_σ(d)>. Planning
+    bounds this duality gap, so it is certain whatever the solver did.
 
     Args:
       smoothing: σ.
       tolerance: of the duality gap, nats.
+    Returns:
+      The optimum, with its duality gap.
     Raises:
       ValueError: σ <= 0 or tolerance <= 0.
-      OptimumError: no attempt came within the tolerance.
+      OptimumError: no attempt reached the tolerance.
     """
     for name, value in (("smoothing", smoothing), ("tolerance", tolerance)):
         if not 0 < value < np.inf:
@@ -69,8 +69,8 @@ def solve(mdp: Mdp, smoothing: float, tolerance: float = 1e-8) -> Optimum:
 
 
 def duality_gap(mdp: Mdp, occupancy: np.ndarray, smoothing: float) -> float:
-    """By how much some policy's H_σ can exceed that of an occupancy [S], at most, nats."""
-    # Far beyond what planning needs elsewhere, so that this bound is not what limits the gap.
+    """Returns a bound on how far any policy's H_σ exceeds that of an occupancy [S], nats."""
+    # Twice as many steps as elsewhere, so that planning does not limit the accuracy of the gap.
     steps = 2 * tabular.converged_steps(mdp)
     with tabular.float64():
         return float(_gap(tabular.on_device(mdp), jnp.asarray(occupancy), smoothing, steps))
@@ -90,7 +90,7 @@ def _evaluate(mdp, policy, smoothing):
 
 def _attempt(problem: _Problem, smoothing: float, scale: float, precision: float) -> np.ndarray:
     """[L, S, A] occupancies that nearly maximise the objective."""
-    num_states = problem.total.shape[0]  # in whose units the unknowns are about 1
+    num_states = problem.total.shape[0]  # scales the unknowns to about 1
 
     def of(function, x, factor):
         return -scale * factor * function(problem.total @ x / num_states, smoothing)
@@ -161,7 +161,7 @@ def _problem(mdp: Mdp) -> _Problem:
 
 
 def _closure(visited: np.ndarray, arrivals: sparse.sparray) -> np.ndarray:
-    """[L S] what can be reached: the solver needs room about its point, and the rest has none."""
+    """[L S] the reachable states: the solver needs an interior, which the others lack."""
     while True:
         reached = visited | (arrivals @ visited > 0)
         if (reached == visited).all():
@@ -169,7 +169,7 @@ def _closure(visited: np.ndarray, arrivals: sparse.sparray) -> np.ndarray:
         visited = reached
 
 
-# H_σ and its derivatives, continued below 0 by their expansion at 0: the solver's steps pass there.
+# H_σ and its derivatives. Below 0, where the solver's steps may lead, they use the expansion at 0.
 def _objective(occupancy: np.ndarray, smoothing: float) -> float:
     inside, beyond = np.maximum(occupancy, 0), np.minimum(occupancy, 0)
     continued = beyond * np.log(smoothing) + beyond**2 / smoothing

@@ -1,4 +1,4 @@
-"""EntGame (Tiapkin et al. 2023) in a known MDP: a newer peer of MaxEnt-V, in V's own terms."""
+"""EntGame (Tiapkin et al. 2023) in a known MDP, for comparison with MaxEnt-V."""
 
 from typing import NamedTuple
 
@@ -11,32 +11,35 @@ from maxent_jax.theory.mdps import Mdp
 
 
 class GameTrace(NamedTuple):
-    """What a game went through, for each of N seeds."""
+    """The measures of a game for N seeds."""
 
     entropy: np.ndarray  # [N, T + 1] of the uniform mixture of the policies so far, nats
-    mixture: np.ndarray  # [N, S] the last
+    mixture: np.ndarray  # [N, S] occupancy of the last mixture
 
 
 def ent_game(
     mdp: Mdp, first: np.ndarray, num_iterations: int, prior: float, sampled: bool, keys: jax.Array
 ) -> GameTrace:
-    """A forecaster predicts the states that a sampler visits; the sampler maximises its log-loss.
+    """Plays EntGame: a forecaster predicts the states that a sampler visits.
 
-    The forecaster's density is in proportion to n(s) + n_0, with n(s) the visits so far; the
-    sampler plans exactly on -log of it. With expected visits that is MaxEnt-V for the entropy
-    itself with a smoothing that vanishes, n_0 over the number of steps so far. The paper's sampler
-    also earns a bonus for what it does not know of the transitions; here they are known.
+    The sampler maximises the forecaster's log-loss. The forecaster's density is proportional to
+    n(s) + n_0, where n(s) counts the visits so far, and the sampler plans exactly on -log of it.
+    With expected visits this is MaxEnt-V for the entropy itself, with a smoothing that vanishes:
+    n_0 divided by the number of steps so far. In the paper the sampler also earns a bonus for
+    uncertainty about the transitions; here they are known.
 
     Args:
-      mdp: one, for all seeds.
+      mdp: one for all seeds.
       first: [N, L, S, A] π_0 of each seed.
       num_iterations: T.
-      prior: n_0 > 0, visits of each state that the forecaster pretends to have seen.
-      sampled: count the states of one episode an iteration, as the paper does, not expected ones.
-      keys: [N] of the episodes.
-    Source: Tiapkin et al. 2023, Algorithm 1.
+      prior: n_0 > 0, visits that the forecaster adds to each state.
+      sampled: count the states of one episode per iteration, as in the paper, not expected ones.
+      keys: [N] typed keys of the episodes.
+    Returns:
+      The trace of all seeds.
     Raises:
       ValueError: n_0 <= 0 or T < 1.
+    Source: Tiapkin et al. 2023, Algorithm 1.
     """
     if not 0 < prior < np.inf:
         raise ValueError(f"prior is {prior}, but must be a positive number")

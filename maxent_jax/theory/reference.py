@@ -1,7 +1,7 @@
-"""Frank-Wolfe as optimisers know it, for reference: the weights depend on what has been found.
+"""Frank-Wolfe with line search or full correction, for reference.
 
-The same exact oracles as in loop.py; but a mixture is chosen by looking at R, which no method of
-the paper does.
+The oracles are exact, as in loop.py, but the weights of a mixture are chosen by looking at R. No
+method of the paper does this.
 """
 
 import functools
@@ -20,7 +20,15 @@ Rule = Callable[[np.ndarray, np.ndarray, float], np.ndarray]
 
 
 def line_search(occupancies: np.ndarray, weights: np.ndarray, smoothing: float) -> np.ndarray:
-    """The step towards the newest policy that gains most: [P, S], [P - 1] -> [P] weights."""
+    """Returns weights after the step towards the newest policy that increases H_σ most.
+
+    Args:
+      occupancies: [P, S] of the policies, oldest first.
+      weights: [P - 1] of the policies before the newest.
+      smoothing: σ.
+    Returns:
+      [P] weights.
+    """
     mixed, newest = weights @ occupancies[:-1], occupancies[-1]
 
     def slope(step):
@@ -35,7 +43,10 @@ def line_search(occupancies: np.ndarray, weights: np.ndarray, smoothing: float) 
 
 
 def fully_corrective(occupancies: np.ndarray, weights: np.ndarray, smoothing: float) -> np.ndarray:
-    """The best weights of all policies so far: [P, S], [P - 1] -> [P]."""
+    """Returns the best weights [P] of all policies so far.
+
+    Args: as `line_search`.
+    """
     return mixture.fully_corrective_weights(occupancies, smoothing, np.append(weights, 0.0))
 
 
@@ -45,11 +56,11 @@ RULES: dict[str, Rule] = {"line search": line_search, "fully corrective": fully_
 def run(
     mdp: Mdp, rule: Rule, first: np.ndarray, num_iterations: int, smoothing: float
 ) -> np.ndarray:
-    """[T + 1] H_σ of the mixture, nats, with planning to convergence.
+    """Returns H_σ of the mixture after each iteration, [T + 1] nats; planning converges.
 
     Args:
-      mdp: one.
-      rule: of RULES.
+      mdp: a single MDP.
+      rule: one of RULES.
       first: [L, S, A] π_0.
       num_iterations: T.
       smoothing: σ.

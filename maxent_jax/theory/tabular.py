@@ -1,7 +1,7 @@
-"""Occupancies, planning and the smoothed entropy of a tabular MDP, exactly, in float64.
+"""Exact occupancies, planning and smoothed entropy of a tabular MDP, in float64.
 
-The functions here are kernels: call them inside `float64()`, with an Mdp from `on_device`, under
-jit, vmap and scan as you like. Axes: S states, A actions, L layers of an Mdp; see mdps.Mdp.
+Call these functions inside `float64()`, with an Mdp from `on_device`. They work under jit, vmap and
+scan. Axes: S states, A actions, L layers of an Mdp; see mdps.Mdp.
 """
 
 import functools
@@ -14,30 +14,30 @@ import numpy as np
 
 from maxent_jax.theory.mdps import Mdp
 
-# Measured on two cores, 20 seeds side by side: a sum over so many successors is 2 to 10 times as
-# fast written out; and where there are more states than so many, it is faster to follow the flow of
-# an occupancy until it no longer changes than to solve for it.
+# Measured on two cores with 20 seeds in parallel. Up to UNROLLED successors, an unrolled sum is 2
+# to 10 times as fast. Above SOLVED states, it is faster to iterate an occupancy until it no longer
+# changes than to solve for it.
 UNROLLED, SOLVED = 8, 100
 ROUNDING = 1e-14  # a smaller change of an occupancy, in the 1-norm, may be rounding alone
-CONVERGED = 1e-10  # what is left of the first error of the values once planning has converged
+CONVERGED = 1e-10  # share of the values' first error that is left when planning has converged
 
 
 def float64() -> AbstractContextManager:
-    """A context in which jax computes in float64; the rest of the package keeps float32."""
+    """Returns a context in which jax computes in float64; the rest of the package uses float32."""
     return jax.enable_x64(True)
 
 
 def on_device(mdp: Mdp) -> Mdp:
-    """The same with arrays of jax."""
+    """Returns the same MDP with jax arrays."""
     return Mdp(*(jnp.asarray(field) for field in mdp))
 
 
 def action_values(mdp: Mdp, reward: jax.Array, values: jax.Array) -> jax.Array:
-    """The reward now and the expected values after it.
+    """Returns the reward plus the expected values after it.
 
     Args:
-      reward: [S], of the state that an action is taken in.
-      values: [L, S].
+      reward: [S] of the state in which an action is taken.
+      values: [L, S] of the states.
     Returns:
       [L, S, A], unnormalised: a sum over the rest of the episode.
     """
@@ -53,50 +53,72 @@ def action_values(mdp: Mdp, reward: jax.Array, values: jax.Array) -> jax.Array:
 
 
 def plan(mdp: Mdp, reward: jax.Array, values: jax.Array, num_steps: jax.Array | int) -> jax.Array:
-    """[L, S] values after so many steps of value iteration, each a backup of all states."""
+    """Runs value iteration; each step is a backup of all states.
+
+    Args:
+      reward: [S] of the states.
+      values: [L, S] initial values.
+      num_steps: [] number of steps.
+    Returns:
+      [L, S] values.
+    """
     return jax.lax.fori_loop(
         0, num_steps, lambda _, v: action_values(mdp, reward, v).max(axis=-1), values
     )
 
 
 def converged_steps(mdp: Mdp) -> int:
-    """Planning steps after which values have converged."""
-    if mdp.discount.shape[-1] > 1:  # a finite horizon is exact after as many
+    """Returns the number of planning steps after which values have converged."""
+    if mdp.discount.shape[-1] > 1:  # a finite horizon is exact after that many steps
         return mdp.discount.shape[-1]
     discount = float(np.max(mdp.discount))
     return 1 if discount == 0 else max(1, math.ceil(math.log(CONVERGED) / math.log(discount)))
 
 
 def planning_loss(mdp: Mdp, reward: jax.Array, values: jax.Array) -> jax.Array:
-    """[] at most how much normalised value the greedy policy of these values loses, nats.
+    """Bounds the normalised value that the greedy policy of these values loses.
 
-    One more backup changes the values by something between m and M. Then no policy's normalised
-    value exceeds that of the values by more than M, and the greedy policy's exceeds it by at least
-    m (Puterman 1994, 6.6): the loss is at most M - m.
+    One more backup changes each value by between m and M. Then every policy's normalised value
+    exceeds that of the values by at most M, and the greedy policy's exceeds it by at least m. So
+    the loss is at most M - m.
+
+    Args:
+      reward: [S] of the states.
+      values: [L, S] of the states.
+    Returns:
+      [] nats.
+    Source: Puterman 1994, 6.6.
     """
     change = action_values(mdp, reward, values).max(axis=-1) - values
     return change.max() - change.min()
 
 
 def best_value(mdp: Mdp, reward: jax.Array, num_steps: jax.Array | int) -> jax.Array:
-    """[] an upper bound of <d, r> over all occupancies d, tight once planning has converged."""
+    """Bounds <d, r> over all occupancies d from above; tight if planning has converged.
+
+    Args:
+      reward: [S] r of the states.
+      num_steps: [] number of planning steps.
+    Returns:
+      [] the bound.
+    """
     values = plan(mdp, reward, jnp.zeros((mdp.discount.shape[0], reward.shape[0])), num_steps)
     change = action_values(mdp, reward, values).max(axis=-1) - values
     return jnp.dot(mdp.start, values[0]) / episode_length(mdp) + change.max()
 
 
 def episode_length(mdp: Mdp) -> jax.Array:
-    """[] expected steps in an episode: 1/(1 - γ), or the horizon."""
+    """Returns the expected number of steps in an episode, []: 1/(1 - γ), or the horizon."""
     return jnp.where(len(mdp.discount) > 1, len(mdp.discount), 1 / (1 - mdp.discount[0]))
 
 
 def greedy(values: jax.Array) -> jax.Array:
-    """[..., A] values to the policy [..., A] that takes the best, the first of equals."""
+    """Returns the policy [..., A] that takes the best of `values` [..., A], the first if equal."""
     return jax.nn.one_hot(values.argmax(axis=-1), values.shape[-1], dtype=values.dtype)
 
 
 def occupancy(mdp: Mdp, policy: jax.Array) -> jax.Array:
-    """[S] how an episode's steps are shared out over the states, of sum 1.
+    """Returns the occupancy [S]: each state's share of an episode's steps, of sum 1.
 
     Args:
       policy: [L, S, A] probabilities.
@@ -108,14 +130,21 @@ def occupancy(mdp: Mdp, policy: jax.Array) -> jax.Array:
 
 
 def greedy_occupancy(mdp: Mdp, reward: jax.Array, values: jax.Array) -> jax.Array:
-    """[S] of the policy that is greedy for these values, `greedy`'s."""
+    """Returns the occupancy of the policy that is greedy for these values.
+
+    Args:
+      reward: [S] of the states.
+      values: [L, S] of the states.
+    Returns:
+      [S] of sum 1.
+    """
     actions = action_values(mdp, reward, values).argmax(axis=-1)
     states = jnp.arange(len(reward))
     return _occupancy(mdp, mdp.successors[states, actions], mdp.probabilities[states, actions])
 
 
 def _occupancy(mdp, reached, chances):
-    """[S] where each layer's states lead to others, [L, S, M], with these chances."""
+    """[S] if each layer's states lead to the states `reached` [L, S, M] with these chances."""
     push = lambda d, reached, chances: jnp.zeros_like(d).at[reached].add(d[:, None] * chances)
     if len(reached) > 1:
         _, visits = jax.lax.scan(lambda d, move: (push(d, *move), d), mdp.start, (reached, chances))
@@ -134,28 +163,40 @@ def _occupancy(mdp, reached, chances):
 
 
 def random_policy(mdp: Mdp, key: jax.Array) -> jax.Array:
-    """[L, S, A] drawn uniformly from all probabilities, in each layer and state by itself."""
+    """Draws a policy [L, S, A] uniformly, independently in each layer and state."""
     shape = (mdp.discount.shape[0], *mdp.successors.shape[:2])
     return jax.random.dirichlet(key, jnp.ones(shape[-1]), shape[:2])
 
 
 def objective(occupancy: jax.Array, smoothing: jax.Array | float) -> jax.Array:
-    """H_σ(d) = -Σ d(s) log(d(s) + σ), [..., S] -> [...] nats; the entropy at σ = 0."""
+    """Returns H_σ(d) = -Σ d(s) log(d(s) + σ) in nats; at σ = 0 this is the entropy.
+
+    Args:
+      occupancy: [..., S] d.
+      smoothing: [] σ.
+    Returns:
+      [...] nats.
+    """
     return -jax.scipy.special.xlogy(occupancy, occupancy + smoothing).sum(axis=-1)
 
 
 def gradient(occupancy: jax.Array, smoothing: jax.Array | float) -> jax.Array:
-    """Its gradient, -log(d(s) + σ) - d(s)/(d(s) + σ), [..., S] -> [..., S]: the reward."""
+    """Returns the reward: the gradient of H_σ, -log(d(s) + σ) - d(s)/(d(s) + σ).
+
+    Args: as `objective`.
+    Returns:
+      [..., S] nats.
+    """
     total = occupancy + smoothing
     return -jnp.log(total) - occupancy / total
 
 
 def sample_visits(mdp: Mdp, policy: jax.Array, max_steps: int, key: jax.Array) -> jax.Array:
-    """[S] how often one episode visits each state.
+    """Plays one episode and returns how often it visits each state, [S].
 
     Args:
-      policy: [L, S, A].
-      max_steps: where an episode is cut that has not ended by then.
+      policy: [L, S, A] probabilities.
+      max_steps: cut the episode after this many steps.
     """
     key_start, key_steps = jax.random.split(key)
     start = jax.random.categorical(key_start, jnp.log(mdp.start))

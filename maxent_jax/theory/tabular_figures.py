@@ -1,4 +1,4 @@
-"""The figures of the command `theory`, from its results alone."""
+"""Draws the figures of the command `theory` from its results alone."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,11 +21,11 @@ METHODS = {  # colour and line
     "line search": ("#4c956c", "--"),
     "fully corrective": ("#2f3e46", "--"),
 }
-SMALLEST = 1e-8  # nats: what the optimum itself is known to
+SMALLEST = 1e-8  # nats, the accuracy of the optimum
 
 
 def draw(results: Mapping[str, Any], directory: Path) -> list[Path]:
-    """All of them as PNG files, each whole or not at all; returns their paths."""
+    """Saves all figures as PNG files, each completely or not at all; returns their paths."""
     figures = {
         "theory_gaps": gaps(results),
         "theory_refresh": refresh(results),
@@ -35,7 +35,7 @@ def draw(results: Mapping[str, Any], directory: Path) -> list[Path]:
 
 
 def gaps(results: Mapping[str, Any]) -> Figure:
-    """Measured gaps of each method under the bounds, a panel for each MDP."""
+    """Draws the measured gaps of each method and the bounds, one panel per MDP."""
     rates, compared = results["rates"], results["methods"]
     figure, axes = _panels(len(rates), 4.6)
     for ax, (name, found) in zip(axes, rates.items(), strict=False):
@@ -63,7 +63,7 @@ def gaps(results: Mapping[str, Any]) -> Figure:
 
 
 def refresh(results: Mapping[str, Any]) -> Figure:
-    """The gap by the planning steps between two refreshes, a panel for each MDP."""
+    """Draws the gap over the planning steps between two refreshes, one panel per MDP."""
     figure, axes = _panels(len(results["refresh"]), 4)
     styles = {
         "V": ("#d1495b", "-o"),
@@ -72,10 +72,10 @@ def refresh(results: Mapping[str, Any]) -> Figure:
         "LA, history": ("#4c956c", "-^"),
     }
     labels = {
-        "V": "V: an iteration is a period",
-        "V from last": "V that starts from its last values",
+        "V": "V: one period per iteration",
+        "V from last": "V, started from its last values",
         "LA": "LA's archive",
-        "LA, history": "all that LA did",
+        "LA, history": "LA's history",
     }
     for ax, (name, found) in zip(axes, results["refresh"].items(), strict=False):
         for series, (color, style) in styles.items():
@@ -94,7 +94,7 @@ def refresh(results: Mapping[str, Any]) -> Figure:
 
 
 def cases(results: Mapping[str, Any]) -> Figure:
-    """Where V loses, oracles that err, and the entropy itself."""
+    """Draws a case in which V loses, inexact oracles, and the entropy itself."""
     figure, axes = _panels(3, 4.2)
     ax, found = axes[0], results["lost"]
     for method in ("V", "H, η = 0.1", "official H, η = 0.1", "line search", "linear weights"):
@@ -102,7 +102,7 @@ def cases(results: Mapping[str, Any]) -> Figure:
         _line(ax, curve["times"], curve["gap"], method, *METHODS[method], lw=1.4)
     times = np.array(found["methods"]["V"]["times"])
     cost = found["first_policy_costs"]
-    ax.plot(times, cost / (times + 1), "k:", lw=1.2, label="what π₀ costs, over T + 1")
+    ax.plot(times, cost / (times + 1), "k:", lw=1.2, label="cost of π₀ / (T + 1)")
     ax.set(title="river swim of 20, γ = 0.9: V loses", xlabel="iterations", ylim=(SMALLEST, None))
     ax.set_ylabel("gap of the smoothed entropy (nats)")
     ax.legend(frameon=False, fontsize=7.5)
@@ -118,7 +118,7 @@ def cases(results: Mapping[str, Any]) -> Figure:
     ax.plot([], [], "k--", lw=1, label="Theorem 1")
     ax.set(xscale="log", yscale="log", xlabel="ε₀ of the density (leftmost: none)")
     ax.set_title(
-        f"V on {results['noise']['on']}, oracles that err, T = {results['settings']['iterations']}"
+        f"V on {results['noise']['on']}, inexact oracles, T = {results['settings']['iterations']}"
     )
     ax.legend(frameon=False, fontsize=7.5)
 
@@ -144,7 +144,7 @@ def _panels(number: int, height: float) -> tuple[Figure, list[Axes]]:
 
 
 def _line(ax: Axes, times, gap, label: str, color: str, style: str, lw: float) -> None:
-    """The median over seeds; what lies below the optimum's own accuracy is left out."""
+    """The median over seeds; values below the optimum's accuracy are left out."""
     middle = np.median(np.array(gap, dtype=float), axis=0)
     ax.plot(
         times, np.where(middle > SMALLEST, middle, np.nan), style, color=color, label=label, lw=lw

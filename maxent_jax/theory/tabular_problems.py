@@ -1,4 +1,4 @@
-"""The MDPs of the command `theory`, what is known of each, and how a run is held against it."""
+"""The MDPs of the command `theory`, their optima and bounds, and runs compared with these."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +13,7 @@ from maxent_jax.errors import UsageError
 from maxent_jax.theory import bounds, loop, mdps, optimum, tabular
 from maxent_jax.theory.mdps import Dynamics, Mdp
 
-FIT_FROM = 10  # iterations: where the rate is fitted from
+FIT_FROM = 10  # the first iteration of the fit of the rate
 
 
 class Problem(NamedTuple):
@@ -22,18 +22,18 @@ class Problem(NamedTuple):
     name: str
     mdps: list[Mdp]  # one for all seeds, or one for each
     smoothing: float
-    best: list[optimum.Optimum]  # as many
+    best: list[optimum.Optimum]  # one for each of `mdps`
     first: np.ndarray  # [N, L, S, A]
     keys: jax.Array  # [N]
 
     @property
     def num_states(self) -> int:
-        """|S|."""
+        """|S|, the number of states."""
         return len(self.mdps[0].start)
 
     @property
     def constants(self) -> tuple[float, float]:
-        """B and β of the smoothed entropy, computed."""
+        """B and β of the smoothed entropy."""
         return (
             bounds.objective_range(self.num_states, self.smoothing),
             bounds.smoothness(self.smoothing),
@@ -41,33 +41,33 @@ class Problem(NamedTuple):
 
     @property
     def mdp(self) -> Mdp:
-        """In the form that `loop.run` takes."""
+        """The MDP in the form that `loop.run` takes."""
         return self.mdps[0] if len(self.mdps) == 1 else mdps.stack(self.mdps)
 
     @property
     def objective(self) -> np.ndarray:
-        """[N] the largest H_σ, nats."""
+        """The largest H_σ of each seed, [N] nats."""
         each = [found.objective for found in self.best]
         return np.array(each * (len(self.first) // len(each)))
 
     @property
     def optimal_occupancy(self) -> np.ndarray:
-        """[N, S]."""
+        """The optimal occupancy of each seed, [N, S]."""
         each = [found.occupancy for found in self.best]
         return np.array(each * (len(self.first) // len(each)))
 
     def reward_at_optimum(self) -> np.ndarray:
-        """[N, S] the gradient of H_σ there: what each state is worth to the optimum."""
+        """Returns the gradient of H_σ at the optimum, [N, S]: the worth of each state there."""
         with tabular.float64():
             return np.asarray(tabular.gradient(jnp.asarray(self.optimal_occupancy), self.smoothing))
 
     @property
     def converged(self) -> int:
-        """Planning steps until values have converged."""
+        """Number of planning steps until values have converged."""
         return tabular.converged_steps(self.mdps[0])
 
     def seeds(self, number: int) -> "Problem":
-        """With the first so many seeds."""
+        """Returns the problem with its first `number` seeds."""
         some = slice(None, number)
         kept = slice(None, number if len(self.mdps) > 1 else None)
         return self._replace(
@@ -78,16 +78,16 @@ class Problem(NamedTuple):
 def make(
     name: str, of_seeds: Sequence[Mdp], num_seeds: int, seed: int, tolerance: float
 ) -> Problem:
-    """With σ = 1/|S|, so that β = 2|S|, and first policies drawn at random.
+    """Makes a problem with σ = 1/|S|, so that β = 2|S|, and with random first policies.
 
     Raises:
-      UsageError: no solution within the tolerance.
+      UsageError: the optimum was not found within the tolerance.
     """
     smoothing = 1 / len(of_seeds[0].start)
     try:
         best = [optimum.solve(mdp, smoothing, tolerance) for mdp in of_seeds]
     except optimum.OptimumError as missed:
-        raise UsageError(f"{name}: {missed}: take a larger --tolerance.") from None
+        raise UsageError(f"{name}: {missed}: set a larger --tolerance.") from None
     keys = jax.random.split(jax.random.key(seed), num_seeds)
     with tabular.float64():
         device = tabular.on_device(of_seeds[0])
@@ -97,7 +97,7 @@ def make(
 
 
 def known(num_seeds: int, discount: float, toy: bool) -> dict[str, list[Mdp]]:
-    """MDPs by name, one for all seeds; of Garnet one for each."""
+    """Returns MDPs by name: one for all seeds, or one per seed for Garnet."""
     some: dict[str, list[Dynamics]] = {
         "river swim": [mdps.river_swim()],
         "Garnet": [mdps.garnet(20, 4, 3, seed) for seed in range(num_seeds)],
@@ -105,7 +105,7 @@ def known(num_seeds: int, discount: float, toy: bool) -> dict[str, list[Mdp]]:
         "small rooms": [mdps.four_rooms(11)],
         "open grid": [mdps.open_grid()],
     }
-    if toy:  # of one shape, so that each program is compiled once
+    if toy:  # all of one shape, so that each program is compiled once
         some = {"river swim": [mdps.river_swim()], "Garnet": [mdps.garnet(6, 2, 3, 0)]}
     made = {name: [mdps.discounted(each, discount) for each in some[name]] for name in some}
     if not toy:
@@ -114,10 +114,10 @@ def known(num_seeds: int, discount: float, toy: bool) -> dict[str, list[Mdp]]:
 
 
 def read(path: Path, discount: float) -> Mdp:
-    """A user's own MDP: an .npz with `transitions` [S, A, S] and `start` [S].
+    """Reads a user's MDP from an .npz file with `transitions` [S, A, S] and `start` [S].
 
     Raises:
-      UsageError: no such file, or no MDP in it.
+      UsageError: the file cannot be read, or holds no MDP.
     """
     try:
         with np.load(path) as file:
@@ -129,7 +129,7 @@ def read(path: Path, discount: float) -> Mdp:
 
 
 def run(problem: Problem, row: MethodRow, iterations: int, **options: Any) -> loop.Trace:
-    """The method on the problem, with planning to convergence unless said otherwise."""
+    """Runs the method on the problem; planning converges unless `options` say otherwise."""
     settings = loop.Settings(
         **({"planning_steps": problem.converged} | options),
         num_iterations=iterations,
@@ -139,19 +139,19 @@ def run(problem: Problem, row: MethodRow, iterations: int, **options: Any) -> lo
 
 
 def gaps(problem: Problem, objective: np.ndarray) -> np.ndarray:
-    """[N, P] nats below the optimum."""
+    """Returns the gap to the optimum of `objective` [N, P], [N, P] nats."""
     return problem.objective[:, None] - objective
 
 
 def checkpoints(iterations: int) -> np.ndarray:
-    """Iterations at which curves are kept: equally spaced in their logarithm."""
+    """Returns the iterations at which curves are kept [C], equally spaced in their logarithm."""
     return np.unique(np.geomspace(1, iterations, 40).round().astype(int))
 
 
 def veritas_bounds(
     problem: Problem, trace: loop.Trace, times: np.ndarray, form: str = "tight"
 ) -> np.ndarray:
-    """[N, C] Theorem 1 after so many iterations, with the errors that the run made."""
+    """Returns Theorem 1's bound after `times` [C] iterations, [N, C], with the run's errors."""
     of_range, beta = problem.constants
     return np.array(
         [
@@ -168,7 +168,7 @@ def veritas_bounds(
 
 
 def hazan_bounds(problem: Problem, trace: loop.Trace, times: np.ndarray, eta: float) -> np.ndarray:
-    """[N, C] the bound of MaxEnt-H after so many iterations."""
+    """Returns the bound of MaxEnt-H after `times` [C] iterations, [N, C]."""
     of_range, beta = problem.constants
     errors = zip(trace.density_error.max(1), trace.planning_error.max(1), strict=True)
     return np.array(

@@ -1,4 +1,4 @@
-"""The studies of the command `theory`: each takes problems and returns figures, JSON-ready."""
+"""The studies of the command `theory`: each takes problems and returns numbers, ready for JSON."""
 
 import time
 from collections.abc import Callable
@@ -18,11 +18,11 @@ from maxent_jax.theory.tabular_problems import FIT_FROM, Problem
 STATES = (2, 10, 100, 1_000, 10_000, 1_000_000)
 ETAS = (0.1, 0.01, 0.001)
 V, LA, H = (METHODS[name] for name in ("v", "la", "h"))
-ARCHIVED_EVERY = 64  # planning steps in an iteration where planning is not to convergence
+ARCHIVED_EVERY = 64  # planning steps in an iteration, where planning does not converge
 
 
 def bound_table() -> list[dict[str, Any]]:
-    """Prop. 2 and 3, and the T from which Theorem 1 says something, by |S|."""
+    """Tabulates Prop. 2 and 3, and the T from which Theorem 1 is informative, by |S|."""
     rows = []
     for states in STATES:
         smoothing = 1 / states
@@ -43,7 +43,7 @@ def bound_table() -> list[dict[str, Any]]:
 
 
 def rate(problem: Problem, iterations: int) -> dict[str, Any]:
-    """How fast V's gap falls, against Theorem 1, and what is left at the end."""
+    """Measures how fast V's gap falls, compares it with Theorem 1, and splits the last gap."""
     started = time.perf_counter()
     trace = problems.run(problem, V, iterations)
     seconds = time.perf_counter() - started
@@ -75,7 +75,7 @@ def rate(problem: Problem, iterations: int) -> dict[str, Any]:
 
 
 def _slope(gap: np.ndarray) -> dict[str, Any]:
-    """Of log gap against log T from T = 10 on, by least squares; mean over seeds, 95 % interval."""
+    """Slope of log gap over log T from T = 10 on, least squares: mean over seeds, 95 % interval."""
     times = np.unique(np.geomspace(FIT_FROM, gap.shape[1] - 1, 60).round().astype(int))
     slopes = np.polyfit(np.log(times), np.log(gap[:, times]).T, 1)[0]
     half = stats.t.ppf(0.975, len(slopes) - 1) * stats.sem(slopes)
@@ -83,19 +83,19 @@ def _slope(gap: np.ndarray) -> dict[str, Any]:
 
 
 def _parts(problem: Problem, trace: loop.Trace, gap: np.ndarray) -> dict[str, Any]:
-    """The share of the last gap that is linear: policies which the optimum has no use for."""
+    """The last gap, and its linear share: that of policies which the optimum does not use."""
     reward = problem.reward_at_optimum()
     linear = (reward * (problem.optimal_occupancy - trace.mixture)).sum(1)
     return {"final_gap": gap.mean(), "linear_share": (linear / gap).mean()}
 
 
 def compare(problem: Problem, iterations: int) -> dict[str, Any]:
-    """H, LA, V and the reference rules: gaps, and the bound that covers each."""
+    """Compares H, LA, V and the reference rules: their gaps, and the bound of each."""
     covered = lambda trace, times: problems.veritas_bounds(problem, trace, times)
     found = {
         "V": _method(problem, V, iterations, covered),
-        # Planning to convergence at each refresh would make LA's reference V's mixture: so it
-        # plans as it is meant to, with a reward that changes with every planning step.
+        # If planning converged at each refresh, LA's reference would be V's mixture. So LA plans
+        # with a reward that changes with every planning step, as it is meant to.
         "LA": _method(
             problem, LA, max(FIT_FROM, iterations // 10), covered, planning_steps=ARCHIVED_EVERY
         ),
@@ -139,7 +139,7 @@ def _method(
 
 
 def refresh(problem: Problem, budget: int) -> dict[str, Any]:
-    """The gap after a fixed number of planning steps, by the steps between two refreshes."""
+    """Measures the gap after a fixed number of planning steps, by steps between two refreshes."""
     periods = [2**i for i in range(10) if 8 * 2**i <= budget]
     found: dict[str, Any] = {"periods": periods, "budget": budget}
     series: dict[str, list[np.ndarray]] = {
@@ -156,7 +156,7 @@ def refresh(problem: Problem, budget: int) -> dict[str, Any]:
         series["LA, history"].append(problems.gaps(problem, trace.history_objective)[:, -1])
     found["gap"] = {name: np.array(gap) for name, gap in series.items()}  # [periods, N]
     middle = {name: np.median(gap, axis=1) for name, gap in found["gap"].items()}
-    # Against V whose iterations have as many planning steps as LA's.
+    # Compared with V whose iterations have as many planning steps as LA's.
     same = periods.index(min(ARCHIVED_EVERY, periods[-1]))
     found["better_until"] = {
         name: max(
@@ -169,7 +169,7 @@ def refresh(problem: Problem, budget: int) -> dict[str, Any]:
 
 
 def noise(problem: Problem, iterations: int) -> list[dict[str, Any]]:
-    """V with oracles that err on purpose, against Theorem 1 with those errors."""
+    """Compares V under inexact oracles with Theorem 1 for the same errors."""
     rows = []
     for density in (0.0, 0.003, 0.01, 0.03):
         for planning in (0.0, 0.01, 0.1):
@@ -194,7 +194,7 @@ def noise(problem: Problem, iterations: int) -> list[dict[str, Any]]:
 def lost(
     length: int, num_seeds: int, seed: int, tolerance: float, iterations: int
 ) -> dict[str, Any]:
-    """Where V loses: one policy is all but optimal, and uniform weights never forget the first."""
+    """Measures a case in which V loses: one policy is nearly optimal, but π_0 keeps its weight."""
     mdp = mdps.discounted(mdps.river_swim(length), 0.9)
     problem = problems.make("long river swim", [mdp], num_seeds, seed, tolerance)
     found = compare(problem, iterations)["methods"]
@@ -206,9 +206,9 @@ def lost(
 
 
 def game(problem: Problem, iterations: int, tolerance: float) -> dict[str, Any]:
-    """V and EntGame by the entropy itself, without smoothing."""
+    """Compares V and EntGame by the entropy itself, without smoothing."""
     one = problem.seeds(1)._replace(first=problem.first, keys=problem.keys)
-    # So little smoothing changes the entropy by 1e-7 nats at most.
+    # This smoothing changes the entropy by at most 1e-7 nats.
     found_best = optimum.solve(one.mdps[0], 1e-7 / problem.num_states, tolerance)
     with tabular.float64():
         best = float(tabular.objective(jnp.asarray(found_best.occupancy), 0.0))
@@ -225,11 +225,11 @@ def game(problem: Problem, iterations: int, tolerance: float) -> dict[str, Any]:
 
 
 def proposition_1(sizes: tuple[int, ...], neighbors: int = 3) -> list[dict[str, Any]]:
-    """LA's reward p log R against H's for the estimated and for the true density of a Gaussian.
+    """Compares LA's reward p log R with H's, for the estimated and the true density of a Gaussian.
 
-    The volume of the k-th neighbour's ball, times N and the density, is about Gamma(k): so that,
-    given the density, LA's reward scatters with variance ψ'(k), and the difference of the two
-    rewards has mean -ψ(k) + log k.
+    The volume of the k-th neighbour's ball, times N and the density, is distributed about as
+    Gamma(k). So, given the density, LA's reward scatters with variance ψ'(k), and the difference of
+    the two rewards has mean -ψ(k) + log k.
     """
     rows = []
     for dims in (1, 2, 7):

@@ -1,1 +1,1 @@
-"""What is shown of a run: its figures, videos, and the tables and page of a report."""
+"""Shows a run: its figures, its videos, and the tables and page of a report."""

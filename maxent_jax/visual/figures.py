@@ -1,4 +1,4 @@
-"""The figures that a run leaves at its end."""
+"""Draws the figures at the end of a run."""
 
 import multiprocessing
 import os
@@ -15,14 +15,13 @@ from maxent_jax.visual import plotting
 
 
 def draw_missing(directory: Path) -> None:
-    """Rolls the archived policies out and draws the figures of a run, unless they are there.
+    """Rolls out the archived policies and draws the figures of a run, unless they exist.
 
-    Of several processes, whose devices are out of each other's reach, one draws in a process of its
-    own.
+    With several processes, which cannot reach each other's devices, a new process draws.
 
     Raises:
       SaveError: a figure cannot be written.
-      RuntimeError: the other process failed.
+      RuntimeError: the new process failed.
     """
     if plotting.all_saved(directory):
         return
@@ -32,7 +31,7 @@ def draw_missing(directory: Path) -> None:
     alone = multiprocessing.get_context("spawn").Process(
         target=_draw, args=(directory, registry.imported)
     )
-    os.environ["JAX_PLATFORMS"] = "cpu"  # of the child: the accelerator's memory is taken
+    os.environ["JAX_PLATFORMS"] = "cpu"  # for the child: the accelerator's memory is in use
     alone.start()
     alone.join()
     if alone.exitcode != 0:

@@ -1,4 +1,4 @@
-"""Episodes as pictures: each with its policy, its time, and a map of where it has been."""
+"""Draws episodes as pictures, each with its policy, its time, and a map of its path."""
 
 import functools
 from collections.abc import Sequence
@@ -13,17 +13,17 @@ from maxent_jax.density import histogram
 from maxent_jax.visual import plotting
 from maxent_jax.visual.rendering import Scene
 
-MAP_SIDE = 0.27  # of the picture's
-MAP_PIXELS = 4  # drawn for one that is shown, for smooth lines
+MAP_SIDE = 0.27  # of the picture's side
+MAP_PIXELS = 4  # drawn for each one shown, for smooth lines
 MAP_OPACITY, GRID_OPACITY = 170, 110  # of 255
 TEXT_HEIGHT = 0.035  # of the picture's side; 11 pixels at least
 INK, PAPER = (25, 32, 40), (255, 255, 255)
-FADE = 0.55  # towards white, of a picture after its episode's end
+FADE = 0.55  # of a picture after its episode's end, towards white
 GAP = 4  # pixels of paper between the pictures of a mosaic
 
 
 class Episode(NamedTuple):
-    """An episode of one policy, to its end."""
+    """An episode of one policy, up to its end."""
 
     name: str
     weight: float  # of the policy in the mixture
@@ -36,16 +36,16 @@ class Film(NamedTuple):
     """What all pictures of a run have in common."""
 
     scene: Scene
-    axes: tuple[str, str]  # names of the map's
-    low: np.ndarray  # [2] the map's corners; it holds the grid and all episodes
+    axes: tuple[str, str]  # names of the map's axes
+    low: np.ndarray  # [2] the map's corners; the map holds the grid and all episodes
     high: np.ndarray  # [2]
     grid: np.ndarray  # [2, 2] the grid's corners, low and high
-    seconds: float  # in a step
-    speed: float | None  # of playback, over that of the simulation; None: stills
+    seconds: float  # per step
+    speed: float | None  # of playback relative to the simulation; None: stills
 
 
 def median_episodes(run: Run, paths: Paths) -> list[Episode]:
-    """One episode of each policy: that of median length."""
+    """Returns one episode of each policy, the one of median length."""
     colors = (255 * plotting.policy_colors(run.num_policies)).astype(int)
     return [
         _episode(run, paths, policy, tuple(colors[policy, :3].tolist()))
@@ -63,7 +63,7 @@ def _episode(run: Run, paths: Paths, policy: int, color: tuple[int, int, int]) -
 
 
 def make(run: Run, scene: Scene, episodes: Sequence[Episode], speed: float | None) -> Film:
-    """The film of these episodes; its map is the grid's, widened to hold them all."""
+    """Makes the film of these episodes; its map is the grid, widened to hold them all."""
     grid = run.components.grid
     corners = np.array([grid.low, grid.high])
     center, half = corners.mean(axis=0), np.diff(corners, axis=0)[0] / 2
@@ -74,7 +74,7 @@ def make(run: Run, scene: Scene, episodes: Sequence[Episode], speed: float | Non
 
 
 def picture(film: Film, episode: Episode, step: int) -> np.ndarray:
-    """[size, size, 3] uint8: the episode at a step; after its end its last state, faded."""
+    """Draws an episode at a step, [size, size, 3] uint8; after its end, its last state, faded."""
     last = len(episode.states) - 1
     shown = min(step, last)
     image = Image.fromarray(film.scene.draw(episode.states[shown]))
@@ -86,7 +86,7 @@ def picture(film: Film, episode: Episode, step: int) -> np.ndarray:
 
 
 def mosaic(pictures: Sequence[np.ndarray], columns: int) -> np.ndarray:
-    """Pictures [H, W, 3] side by side in rows; blank where the last row lacks one."""
+    """Arranges pictures [H, W, 3] in rows; the last row may end blank."""
     height, width = np.array(pictures[0].shape[:2]) + GAP
     num_rows = -(-len(pictures) // columns)
     sheet = np.full((num_rows * height, columns * width, 3), PAPER, np.uint8)
@@ -97,7 +97,7 @@ def mosaic(pictures: Sequence[np.ndarray], columns: int) -> np.ndarray:
 
 
 def stills(length: int, number: int) -> list[int]:
-    """Steps equally spaced in time, from the first to the last of so many."""
+    """Returns `number` steps equally spaced in time, from the first to the last of `length`."""
     return np.linspace(0, length - 1, number).round().astype(int).tolist()
 
 
@@ -121,7 +121,7 @@ def _write(image: Image.Image, film: Film, episode: Episode, step: int) -> None:
 
 
 def _draw_map(image: Image.Image, film: Film, episode: Episode, step: int) -> None:
-    """In the upper right corner: the grid, the route so far, and where it has come to."""
+    """In the upper right corner: the grid, the route so far, and its end."""
     side = round(MAP_SIDE * image.width)
     sheet = Image.new("RGBA", (side * MAP_PIXELS,) * 2, (*PAPER, MAP_OPACITY))
     draw = ImageDraw.Draw(sheet)

@@ -1,4 +1,4 @@
-"""What drawing needs, checked before MuJoCo is loaded: bodies, and OpenGL with no screen."""
+"""Checks, before MuJoCo is loaded, what drawing needs: bodies, and OpenGL without a screen."""
 
 import functools
 import importlib
@@ -11,7 +11,7 @@ from maxent_jax.errors import RunError
 
 VARIABLE = "MUJOCO_GL"
 BACKENDS = {"darwin": ("cgl",), "win32": ("wgl",)}.get(sys.platform, ("egl", "osmesa"))
-PACKAGES = "libegl1 and libgl1 (egl), or libosmesa6 (osmesa)"  # Debian's and Ubuntu's names
+PACKAGES = "libegl1 and libgl1 (egl), or libosmesa6 (osmesa)"  # as Debian and Ubuntu name them
 READS_VARIABLE = "mujoco.rendering.classic.gl_context"  # once, when MuJoCo is loaded
 PROBE = """
 import mujoco
@@ -25,25 +25,26 @@ PROBE_SECONDS = 20
 
 
 class RenderingError(RunError):
-    """A run that cannot be drawn here."""
+    """A run cannot be drawn here."""
 
 
 def check_drawable(env: str) -> None:
-    """Refuses environments without bodies of MuJoCo's, as far as their names tell.
+    """Rejects environments without MuJoCo bodies, as far as their names tell.
 
     Raises:
-      RenderingError: one of the classic environments, or of brax's.
+      RenderingError: a classic environment, or one of brax.
     """
     if env not in MUJOCO_ENVS and not env.startswith("user:"):
         raise RenderingError(
-            f"environment '{env}' cannot be drawn: only MuJoCo's robots can "
+            f"environment '{env}' cannot be drawn: only MuJoCo's robots can be "
             f"({', '.join(MUJOCO_ENVS)}, and user:NAME made by maxent_jax.envs.from_xml)."
         )
 
 
 def draw_nothing() -> None:
-    """For commands that draw no robots, before MuJoCo is loaded: it cannot be with a MUJOCO_GL that
-    it does not know, or whose system packages are missing.
+    """Turns off MuJoCo's rendering, for commands that draw no robots, before MuJoCo is loaded.
+
+    MuJoCo cannot be loaded with an unknown MUJOCO_GL, or without the system packages that it needs.
     """
     if "mujoco" not in sys.modules:
         os.environ[VARIABLE] = "disable"
@@ -51,9 +52,9 @@ def draw_nothing() -> None:
 
 @functools.cache
 def choose_backend() -> str:
-    """Settles MUJOCO_GL: the user's own value, else the first of egl and osmesa that draws.
+    """Sets and returns MUJOCO_GL: the user's value, or the first of egl and osmesa that draws.
 
-    It is best called before MuJoCo is loaded; afterwards MuJoCo is told of the choice.
+    Call it before MuJoCo is loaded if possible; afterwards, it makes MuJoCo read the choice again.
 
     Raises:
       RenderingError: nothing draws without a screen here, or the user's value does not.
@@ -76,7 +77,7 @@ def choose_backend() -> str:
 
 
 def _draws(backend: str) -> bool:
-    """Tried in a process of its own: a backend that fails leaves its process without any."""
+    """Tries a backend in another process: one that fails leaves its process without any."""
     try:
         done = subprocess.run(
             [sys.executable, "-c", PROBE],

@@ -1,4 +1,4 @@
-"""The figures of a run: curves, the log-occupancy map (Fig. 5), and the paths of each policy."""
+"""Draws the figures of a run: curves, the log-occupancy map (Fig. 5), and policies' paths."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from maxent_jax.runs.files import FIGURES, whole_file
 COVERAGE_AXES = (
     ("iteration", "iteration"),
     ("env_steps", "thousand env steps"),
-    ("wall_seconds", "wall-clock (s)"),
+    ("wall_seconds", "wall-clock time (s)"),
 )
 COMPARED = (
     ("cumulative", "training", "-"),
@@ -32,13 +32,13 @@ AGENT, MIXTURE, RANDOM = "#1b6ca8", "#d1495b", "#7a7a7a"
 
 
 def curves(run: Run) -> Figure:
-    """Coverage and entropy against iterations, env steps and wall-clock."""
+    """Draws coverage and entropy against iterations, env steps and wall-clock time."""
     figure = Figure(figsize=(11, 6.4), layout="constrained")
-    axes = _axes_of_curves(figure, f"visited cells of {run.components.grid.num_cells:,}")
+    axes = _axes_of_curves(figure, f"visited cells, of {run.components.grid.num_cells:,}")
     for prefix, name, color, style in (
         ("cumulative", "training, all states so far", AGENT, "-o"),
         ("mixture", "rollouts of the mixture", MIXTURE, "-s"),
-        ("random", "random policy, as many steps", RANDOM, "--"),
+        ("random", "random policy, same number of steps", RANDOM, "--"),
     ):
         _draw_curves(axes, run, prefix, style, color=color, label=name, ms=4)
     _start_at_zero(axes)
@@ -47,10 +47,10 @@ def curves(run: Run) -> Figure:
 
 
 def comparison(seeds: Mapping[str, Sequence[Run]]) -> Figure:
-    """The curves of several runs, one colour each, and of all their seeds.
+    """Draws the curves of several runs and all their seeds, one colour per run.
 
     Args:
-      seeds: the seeds of each run, by a name for the legend.
+      seeds: the seeds of each run, by the run's name in the legend.
     """
     figure = Figure(figsize=(11, 6.8), layout="constrained")
     axes = _axes_of_curves(figure, "visited cells")
@@ -65,7 +65,7 @@ def comparison(seeds: Mapping[str, Sequence[Run]]) -> Figure:
     axes[1, 0].legend(handles=styles, frameon=False, fontsize=9, loc="lower right")
     legend = figure.legend(handles=colors, frameon=False, fontsize=9, loc="outside lower center")
     for text in legend.get_texts():
-        text.set_parse_math(False)  # a name may hold any sign
+        text.set_parse_math(False)  # a name may contain any sign
     return figure
 
 
@@ -82,13 +82,13 @@ def _axes_of_curves(figure: Figure, coverage_label: str) -> np.ndarray:
 
 
 def _start_at_zero(axes: np.ndarray) -> None:
-    """Once all is drawn: it ends the automatic choice of the upper limit."""
+    """Call when all is drawn: it ends the automatic choice of the upper limit."""
     for ax in axes[:, 0]:
         ax.set_ylim(bottom=0)
 
 
 def _draw_curves(axes: np.ndarray, run: Run, prefix: str, *style: str, **options: Any) -> None:
-    """One line in each of the axes; none for what the run did not measure."""
+    """Draws one line in each of the axes, none for what the run did not measure."""
     for quantity, row in zip(("coverage", "entropy"), axes, strict=True):
         values = run.metrics.get(f"{prefix}_{quantity}")
         if values is None:
@@ -99,14 +99,14 @@ def _draw_curves(axes: np.ndarray, run: Run, prefix: str, *style: str, **options
 
 
 def occupancy_map(run: Run, mixture_cells: np.ndarray) -> Figure:
-    """log10 of the visits to each cell: in training, and by the mixture (after the paper's Fig. 5).
+    """Draws log10 of the visits to each cell, in training and by the mixture (as in Fig. 5).
 
     Args:
-      mixture_cells: [bins, bins] share of the mixture's occupancy.
+      mixture_cells: [bins, bins] share of the mixture's states in each cell.
     """
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     panels = (
-        ("states met in training", run.histogram / max(run.histogram.sum(), 1)),
+        ("states visited in training", run.histogram / max(run.histogram.sum(), 1)),
         ("rollouts of the mixture", mixture_cells),
     )
     visited = np.concatenate([np.log10(cells[cells > 0]) for _, cells in panels])
@@ -119,13 +119,13 @@ def occupancy_map(run: Run, mixture_cells: np.ndarray) -> Figure:
 
 
 def fireworks(run: Run, paths: Paths) -> Figure:
-    """Where the episodes of each policy go, one colour for each policy."""
+    """Draws the paths of each policy's episodes, one colour per policy."""
     figure = Figure(figsize=(7.4, 6.6), layout="constrained")
     ax = figure.subplots()
     draw_paths(ax, run, paths)
     for policy, color in enumerate(policy_colors(run.num_policies)):
         ax.plot([], [], color=color, label=f"π{policy}" + (" (untrained)" if policy == 0 else ""))
-    ax.set_title("paths of the archived policies; dots where they end")
+    ax.set_title("paths of the archived policies; dots mark their ends")
     ax.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
     return _finish(figure, run)
 
@@ -136,7 +136,7 @@ def draw_occupancy(
     shares: np.ndarray,
     limits: tuple[float | None, float | None] = (None, None),
 ) -> AxesImage:
-    """log10 of the share of states in each cell, [bins, bins], within limits of the colours."""
+    """Draws log10 of the share of states in each cell, [bins, bins], within colour limits."""
     low, high = limits
     image = ax.imshow(
         np.log10(np.where(shares > 0, shares, np.nan)).T,
@@ -151,7 +151,7 @@ def draw_occupancy(
 
 
 def draw_paths(ax: Axes, run: Run, paths: Paths) -> None:
-    """Where the episodes of each policy go, and the grid's edge."""
+    """Draws the paths of each policy's episodes, and the edge of the grid."""
     colors = policy_colors(run.num_policies)
     for states, alive, policy in zip(*paths, strict=True):
         xy = np.asarray(histogram.locate(states[alive], run.components.grid))
@@ -172,13 +172,13 @@ def draw_paths(ax: Axes, run: Run, paths: Paths) -> None:
 
 
 def policy_colors(num_policies: int) -> np.ndarray:
-    """[P, 4] RGBA in [0, 1]: black for the untrained policy, then from blue to red."""
+    """Returns [P, 4] RGBA in [0, 1]: black for the untrained policy, then from blue to red."""
     trained = matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, max(num_policies - 1, 1)))
     return np.concatenate([[[0, 0, 0, 1]], trained])[:num_policies]
 
 
 def save_all(run: Run, mixture_cells: np.ndarray, paths: Paths) -> None:
-    """The three figures, into the run's directory."""
+    """Saves the three figures of a run; mixture_cells [bins, bins] as in `occupancy_map`."""
     drawn = curves(run), occupancy_map(run, mixture_cells), fireworks(run, paths)
     for name, figure in zip(NAMES, drawn, strict=True):
         save(figure, run.path / FIGURES, name)
@@ -190,7 +190,7 @@ def all_saved(run_directory: Path) -> bool:
 
 
 def save(figure: Figure, directory: Path, name: str) -> Path:
-    """Writes a figure as PNG, whole or not at all."""
+    """Writes a figure as PNG, atomically; returns its path."""
     path = directory / f"{name}.png"
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=110, bbox_inches="tight")
@@ -208,7 +208,7 @@ def _name_axes(ax: Axes, run: Run) -> None:
 
 
 def _finish(figure: Figure, run: Run) -> Figure:
-    """Title and, below, every deviation from the paper by name."""
+    """Adds a title and, below, every departure from the paper by name."""
     config = run.config
     figure.suptitle(
         f"MaxEnt-{config.method.upper()}, {config.env}, preset {config.preset}, seed {run.seed}"

@@ -1,6 +1,6 @@
-"""Pictures of states: a robot on an endless floor, seen by a camera that follows its torso.
+"""Draws states: a robot on an endless floor, seen by a camera that follows its torso.
 
-The observation of MuJoCo's robots begins with the positions, so that no picture needs a simulation.
+The observation of MuJoCo's robots begins with the positions, so drawing needs no simulation.
 """
 
 from pathlib import Path
@@ -15,7 +15,7 @@ from maxent_jax.visual.headless import RenderingError
 
 AZIMUTH, ELEVATION = 90.0, -20.0  # degrees: x to the right, y into the picture, slightly from above
 DISTANCE = 2.3  # of the camera, in extents of the robot
-FOG = (3.0, 12.0)  # where it begins and hides all, in extents: the floor ends in the sky
+FOG = (3.0, 12.0)  # where it begins and where it hides all, in extents: the floor ends in the sky
 SQUARE = 1.0  # metres, the side of a square of the floor
 SKY, ZENITH = (0.93, 0.95, 0.97), (0.70, 0.80, 0.90)
 FLOOR = (0.80, 0.83, 0.86), (0.66, 0.70, 0.75)
@@ -23,13 +23,13 @@ AMBIENT, DIFFUSE = (0.45, 0.45, 0.45), (0.35, 0.35, 0.35)  # of the light at the
 
 
 class Scene:
-    """Draws one robot. A context manager, for it holds an OpenGL context.
+    """Draws one robot. A context manager, because it holds an OpenGL context.
 
     Args:
       xml: the robot's MJCF file.
       size: side of a picture, pixels.
     Raises:
-      RenderingError: nothing draws here.
+      RenderingError: this machine cannot draw.
     """
 
     def __init__(self, xml: Path, size: int):
@@ -53,21 +53,21 @@ class Scene:
         self._renderer.close()
 
     def draw(self, state: np.ndarray) -> np.ndarray:
-        """[size, size, 3] uint8: the robot in a state [D], which begins with its positions."""
+        """Draws the robot in a state [D] that begins with its positions: [size, size, 3] uint8."""
         self._data.qpos[:] = state[: self._model.nq]
         mujoco.mj_forward(self._model, self._data)
         self._camera.lookat = self._data.xpos[self._torso]
-        # An endless plane is laid out around where the camera last was: move that first.
+        # MuJoCo lays out an endless plane around the camera's last place: move the camera first.
         mujoco.mjv_updateCamera(self._model, self._data, self._camera, self._renderer.scene)
         self._renderer.update_scene(self._data, self._camera)
         return self._renderer.render()
 
 
 def scene(components: Components, size: int) -> Scene:
-    """The scene of a run's environment.
+    """Makes the scene of a run's environment.
 
     Raises:
-      RenderingError: it is none of MuJoCo's, or observes no positions, or nothing draws here.
+      RenderingError: it is not MuJoCo's, does not observe positions, or this machine cannot draw.
     """
     env = components.env
     if not isinstance(env, MujocoEnv) or env.observation_size < env.model.nq:
@@ -79,7 +79,7 @@ def scene(components: Components, size: int) -> Scene:
 
 
 def _model(xml: Path, size: int) -> mujoco.MjModel:
-    """The file's model under our sky and light, its planes endless: runs leave those of the XML."""
+    """The file's model with our sky, light and endless planes: runs leave those of the XML."""
     spec = mujoco.MjSpec.from_file(str(xml))
     _hang_sky(spec)
     _lay_floor(spec)
@@ -122,5 +122,5 @@ def _lay_floor(spec: mujoco.MjSpec) -> None:
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "maxent_floor"
     for geom in spec.geoms:
         if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
-            geom.size[:2] = 0  # MuJoCo's word for endless
+            geom.size[:2] = 0  # endless, to MuJoCo
             geom.material, geom.rgba = "maxent_floor", np.ones(4)

@@ -1,4 +1,4 @@
-"""The tables of a report: numbers of runs as text."""
+"""Makes the tables of a report: numbers of runs as text."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -28,12 +28,12 @@ SECONDS = (
     ("wall_train", "of training", np.sum),
     ("wall_end", "of evaluation", np.sum),
     ("wall_first_step", "to the end of the first segment", np.max),
-    ("wall_seconds", "in all", np.max),
+    ("wall_seconds", "in total", np.max),
 )
 
 
 class Table(NamedTuple):
-    """A table of text. Where there are colours, one for each row marks it."""
+    """A table of text. If there are colours, each row is marked with one."""
 
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -41,7 +41,7 @@ class Table(NamedTuple):
 
 
 def number(value: Any, how: str) -> str:
-    """A number as text, MISSING for one that is not finite or no number."""
+    """Formats a number; returns MISSING if it is not finite, or not a number."""
     try:
         value = float(value)
     except (TypeError, ValueError):
@@ -50,25 +50,25 @@ def number(value: Any, how: str) -> str:
 
 
 def last(run: Run, name: str) -> Any:
-    """A metric after the last complete iteration; None where there is none."""
+    """Returns a metric after the last complete iteration; None if there is none."""
     column = run.metrics.get(name)
     return None if column is None or not len(column) else column[-1]
 
 
 def headline(seeds: Sequence[Run]) -> dict[str, Any]:
-    """A sentence about a run, and its figures: means over the seeds."""
+    """Returns a sentence about a run, and its main numbers, as means over the seeds."""
     first = seeds[0]
     cells = f"of {first.components.grid.num_cells:,}"
     trained = f"{first.num_policies - 1} of {first.config.archive_size - 1} policies trained"
-    kind = "1 seed" if len(seeds) == 1 else f"{len(seeds)} seeds, of which these are the means"
+    kind = "1 seed" if len(seeds) == 1 else f"means over {len(seeds)} seeds"
     tiles = (
         ("cells, training", "cumulative_coverage", ",.0f", cells),
         ("cells, random", "random_coverage", ",.0f", cells),
         ("cells, mixture", "mixture_coverage", ",.0f", cells),
         ("entropy, training", "cumulative_entropy", ".2f", "nats"),
         ("entropy, mixture", "mixture_entropy", ".2f", "nats"),
-        ("env steps", "env_steps", ",.0f", "for each seed" if len(seeds) > 1 else "of training"),
-        ("wall-clock", "wall_seconds", ",.0f", "seconds"),
+        ("env steps", "env_steps", ",.0f", "per seed" if len(seeds) > 1 else "of training"),
+        ("wall-clock time", "wall_seconds", ",.0f", "seconds"),
     )
     return {
         "sentence": f"{trained} · {kind}",
@@ -85,7 +85,7 @@ def _mean_last(seeds: Sequence[Run], name: str) -> float | None:
 
 
 def results(seeds: Mapping[str, Sequence[Run]]) -> Table:
-    """One row for each run and seed, after its last complete iteration."""
+    """Makes one row for each run and seed, after its last complete iteration."""
     rows = [
         [
             name,
@@ -102,7 +102,7 @@ def results(seeds: Mapping[str, Sequence[Run]]) -> Table:
 
 
 def iterations(run: Run) -> Table:
-    """One row for each complete iteration."""
+    """Makes one row for each complete iteration."""
     measured = [metric for metric in METRICS if metric[0] in run.metrics]
     rows = [
         [str(i + 1), *(number(run.metrics[name][i], how) for name, _, how in measured)]
@@ -112,7 +112,7 @@ def iterations(run: Run) -> Table:
 
 
 def policies(run: Run, visited: Occupancy, seed: int) -> Table:
-    """What each policy does in fresh episodes."""
+    """Makes one row for each policy: what it does in new episodes."""
     where = ", ".join(run.components.grid.names)
     rows = [
         [
@@ -125,7 +125,7 @@ def policies(run: Run, visited: Occupancy, seed: int) -> Table:
         ]
         for summary in run.summaries(visited, seed)
     ]
-    head = ["policy", "weight", "return", "reward a step", "steps an episode"]
+    head = ["policy", "weight", "return", "reward per step", "steps per episode"]
     colors = [
         f"rgb({r * 255:.0f} {g * 255:.0f} {b * 255:.0f})"
         for r, g, b, _ in plotting.policy_colors(run.num_policies)
@@ -134,28 +134,28 @@ def policies(run: Run, visited: Occupancy, seed: int) -> Table:
 
 
 def measures(measured: Mapping[str, float]) -> Table:
-    """What the mixture covers in fresh episodes."""
+    """Makes one row for each measure of what the mixture covers in new episodes."""
     named = (
         ("mixture_coverage", "visited cells", ",.0f"),
-        ("mixture_entropy", "entropy of the cells, nats", ".2f"),
-        ("mixture_knn_entropy", "entropy of the features, nats", ".2f"),
-        ("mixture_off_grid_share", "share of it off the grid", ".1%"),
-        ("evaluation_episode_length", "steps an episode", ",.0f"),
+        ("mixture_entropy", "entropy of the cells (nats)", ".2f"),
+        ("mixture_knn_entropy", "entropy of the features (nats)", ".2f"),
+        ("mixture_off_grid_share", "share of states off the grid", ".1%"),
+        ("evaluation_episode_length", "steps per episode", ",.0f"),
     )
     return Table([], [[what, number(measured.get(name), how)] for name, what, how in named])
 
 
 def budget(run: Run, planned: Any) -> Table:
-    """Steps planned, as config.json has them, and done; and where the time went."""
+    """Makes rows of steps planned (in config.json) and done, and of the time spent."""
     planned = planned if isinstance(planned, dict) else {}
     rows = [
         [what, number(planned.get(name), ",.0f"), number(last(run, name), ",.0f")]
         for name, what in (("env_steps", "env steps"), ("gradient_steps", "gradient steps"))
     ]
     rows += [
-        ["policies, the untrained one too", str(run.config.archive_size), str(run.num_policies)],
+        ["policies, with the untrained one", str(run.config.archive_size), str(run.num_policies)],
         ["env steps of the mixture's rollouts", "", _reduced(run, "num_rollout_steps", np.sum)],
-        ["steps that left the finite numbers", "", _reduced(run, "num_invalid", np.sum)],
+        ["steps with a number that is not finite", "", _reduced(run, "num_invalid", np.sum)],
     ]
     rows += [[f"seconds {what}", "", _reduced(run, name, how)] for name, what, how in SECONDS]
     rows.append(["peak memory of the device, bytes", "", _reduced(run, "wall_peak_bytes", np.max)])
@@ -168,12 +168,12 @@ def _reduced(run: Run, name: str, how: Callable[[np.ndarray], Any]) -> str:
 
 
 def departures(config: Config) -> Table:
-    """What the run does otherwise than the paper, and why it says so."""
+    """Makes one row for each departure from the paper: setting, value and meaning."""
     rows = [[name, str(config[name]), why] for name, why in config.deviations().items()]
     return Table(["setting", "value", "what it means"], rows)
 
 
 def pairs(content: Any) -> Table:
-    """The entries of a dictionary; none for anything else."""
+    """Makes one row for each entry of a dictionary; no rows for anything else."""
     entries = content.items() if isinstance(content, dict) else ()
     return Table([], [[str(key), str(value)] for key, value in entries])

@@ -1,4 +1,4 @@
-"""Writes mp4 files with the ffmpeg that imageio-ffmpeg, of the extra `render`, carries."""
+"""Writes mp4 files with the ffmpeg in imageio-ffmpeg (extra `render`)."""
 
 import contextlib
 import itertools
@@ -15,10 +15,10 @@ QUALITY = 21  # x264's constant rate factor: 18 looks lossless, 23 is its defaul
 
 
 def check() -> None:
-    """Looks for ffmpeg.
+    """Checks that ffmpeg is installed.
 
     Raises:
-      UsageError: it is missing.
+      UsageError: ffmpeg is missing.
     """
     try:
         import imageio_ffmpeg
@@ -26,12 +26,12 @@ def check() -> None:
         imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError):
         raise UsageError(
-            'videos need imageio-ffmpeg: pip install "maxent_jax[render]" adds it.'
+            'videos need imageio-ffmpeg, which is not installed: pip install "maxent_jax[render]".'
         ) from None
 
 
 def write(path: Path, frames: Iterator[np.ndarray], frame_rate: float) -> None:
-    """A video of at least one frame, [H, W, 3] uint8, H and W even, at so many a second.
+    """Writes a video of at least one frame, [H, W, 3] uint8 with even H and W; frame_rate in Hz.
 
     Raises:
       OSError: ffmpeg cannot write it.
@@ -43,11 +43,11 @@ def write(path: Path, frames: Iterator[np.ndarray], frame_rate: float) -> None:
     command = [imageio_ffmpeg.get_ffmpeg_exe(), *("-y", "-loglevel", "error")]
     command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
     command += ["-r", str(frame_rate), "-i", "-", "-c:v", "libx264", "-crf", str(QUALITY)]
-    # What every browser plays, and before all of it has arrived. A bare path may look like a flag.
+    # Every browser plays this, even before all has arrived. A bare path could look like a flag.
     command += ["-pix_fmt", "yuv420p", "-movflags", "+faststart", f"file:{path}"]
     with subprocess.Popen(command, stdin=PIPE, stderr=PIPE) as ffmpeg:
         assert ffmpeg.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # it has ended, and says why
+        with contextlib.suppress(BrokenPipeError):  # ffmpeg has ended, and says why
             for frame in itertools.chain([first], frames):
                 ffmpeg.stdin.write(frame.tobytes())
         _, said = ffmpeg.communicate()

@@ -19,14 +19,14 @@ from maxent_jax.density import histogram
 from maxent_jax.envs import pendulum
 
 NUM_ACTIONS = 3  # backwards, none, forwards
-EPSILON = float(np.finfo(np.float32).eps)  # official: beside the deviation of the returns
+EPSILON = float(np.finfo(np.float32).eps)  # official: added to the deviation of the returns
 
 Policy = tuple[tuple[jax.Array, jax.Array], ...]  # weight [I, O] and bias [O] of each layer
 Probabilities = Callable[[jax.Array], jax.Array]  # observation [D] -> [3]
 
 
 class Path(NamedTuple):
-    """T steps of one trajectory, which goes on from a plain reset where it ended."""
+    """T steps of one trajectory, which continues from a plain reset after each end."""
 
     observation: jax.Array  # [T, D] for which the action was chosen
     action: jax.Array  # [T] int32, 0 to 2
@@ -36,12 +36,12 @@ class Path(NamedTuple):
 
 
 def init_policy(settings: Settings, key: jax.Array) -> Policy:
-    """Xavier-uniform weights, and biases uniform within ±1/sqrt(inputs), PyTorch's default."""
+    """Draws Xavier-uniform weights, and biases uniform within ±1/sqrt(inputs) as in PyTorch."""
     hidden = settings.hidden_size
     sizes = (envs.make(settings.env).observation_size, hidden, hidden, NUM_ACTIONS)
     shapes = [(inputs + 1, outputs) for inputs, outputs in itertools.pairwise(sizes)]
     ends = np.cumsum([np.prod(shape) for shape in shapes])
-    uniform = jax.random.uniform(key, (ends[-1],), minval=-1.0)  # drawn at once: compiles faster
+    uniform = jax.random.uniform(key, (ends[-1],), minval=-1.0)  # one draw compiles faster
 
     def layer(shape, numbers):
         inputs, outputs = shape[0] - 1, shape[1]
@@ -52,7 +52,7 @@ def init_policy(settings: Settings, key: jax.Array) -> Policy:
 
 
 def logits(policy: Policy, observation: jax.Array) -> jax.Array:
-    """[D] -> [3], with ReLU between the layers."""
+    """Returns the logits of the actions, [D] -> [3], with ReLU between the layers."""
     *hidden, (weight, bias) = policy
     for inner in hidden:
         observation = jax.nn.relu(observation @ inner[0] + inner[1])
@@ -60,17 +60,17 @@ def logits(policy: Policy, observation: jax.Array) -> jax.Array:
 
 
 def probabilities_of(policy: Policy) -> Probabilities:
-    """Of one policy's actions."""
+    """Returns the function that gives a policy's action probabilities."""
     return lambda observation: jax.nn.softmax(logits(policy, observation))
 
 
 def random_probabilities(_observation: jax.Array) -> jax.Array:
-    """All actions alike."""
+    """Gives every action the same probability, [D] -> [3]."""
     return jnp.full(NUM_ACTIONS, 1 / NUM_ACTIONS)
 
 
 def plain_reset(settings: Settings, uniform: jax.Array) -> jax.Array:
-    """[2] physics state, made of uniform numbers [2]."""
+    """Makes a physics state [2] from uniform numbers [2]."""
     low, high = jnp.array(settings.reset_low), jnp.array(settings.reset_high)
     return low + (high - low) * uniform
 
@@ -78,9 +78,16 @@ def plain_reset(settings: Settings, uniform: jax.Array) -> jax.Array:
 def rollout(
     settings: Settings, probabilities: Probabilities, start: jax.Array, uniform: jax.Array
 ) -> Path:
-    """A trajectory from a physics state [2]; uniform numbers [T, 3] draw actions and resets.
+    """Plays a trajectory from a physics state.
 
-    As in the official code, what the policy sees after an end is still the state at the goal.
+    As in the official code, after an end the policy still sees the state at the goal.
+
+    Args:
+      probabilities: of the actions, given an observation.
+      start: [2] physics state.
+      uniform: [T, 3] uniform numbers that draw the actions and resets.
+    Returns:
+      The path of T steps.
     """
     env = envs.make(settings.env)
     observed = pendulum.observe(start) if settings.env == "pendulum" else start
@@ -100,14 +107,14 @@ def rollout(
 
 
 def normalised_returns(rewards: jax.Array, discount: float) -> jax.Array:
-    """[T] discounted sums of rewards [T] from each step on, of mean 0 and sample deviation 1."""
+    """Returns the discounted sum of `rewards` [T] from each step on, [T], standardised."""
     add = lambda later, reward: (reward + discount * later,) * 2
     returns = jax.lax.scan(add, jnp.zeros(()), rewards, reverse=True)[1]
     return (returns - jnp.mean(returns)) / (jnp.std(returns, ddof=1) + EPSILON)
 
 
 def loss(policy: Policy, path: Path, returns: jax.Array) -> jax.Array:
-    """[] minus the sum over an episode of the actions' log-probabilities times returns [T]."""
+    """Returns minus the sum over an episode of log-probability times `returns` [T]."""
     log_probabilities = jax.nn.log_softmax(jax.vmap(logits, (None, 0))(policy, path.observation))
     chosen = jnp.take_along_axis(log_probabilities, path.action[:, None], axis=1)[:, 0]
     return -jnp.sum(chosen * returns)
@@ -120,13 +127,13 @@ def train(
     num_episodes: jax.Array | int,
     key: jax.Array,
 ) -> tuple[Policy, jax.Array]:
-    """A policy from scratch.
+    """Trains a policy from scratch.
 
     Args:
       reward: [cells] of the state reached.
-      start: [2] physics state in which every second episode begins, the first among them; the
-        others begin with a plain reset.
-      num_episodes: after each an update of Adam.
+      start: [2] physics state in which the first and then every second episode begins; the others
+        begin with a plain reset.
+      num_episodes: [] episodes, with one Adam update after each.
     Returns:
       The policy, and how often training visited each cell, [bins, bins] int32.
     """

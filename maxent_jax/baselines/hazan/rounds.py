@@ -1,4 +1,4 @@
-"""A round of MaxEnt-H: train a policy, play the mixture of all so far, make the next reward.
+"""A round of MaxEnt-H: train a policy, play the mixture of all policies, make the next reward.
 
 Source: collect_baseline.py and curiosity.py of github.com/abbyvansoest/maxent_base.
 """
@@ -18,28 +18,36 @@ from maxent_jax.types import Metrics
 
 
 class State(NamedTuple):
-    """What the next round needs of those before."""
+    """What the next round needs from the previous ones."""
 
-    policies: Policy  # [P, ...] zero in rounds to come
+    policies: Policy  # [P, ...] zero in future rounds
     reward: jax.Array  # [cells]
     start: jax.Array  # [2] physics state
-    has_start: jax.Array  # bool: false where a run had ended before the time that was drawn
+    has_start: jax.Array  # bool: false if the run had ended before the drawn time
     visits: jax.Array  # [bins, bins] int32, in training
     rollout_steps: jax.Array  # int32
 
 
 class Runs(NamedTuple):
-    """N runs side by side, the first of them those that make the reward, the others fresh."""
+    """N runs in parallel: the first ones define the reward, the others are fresh."""
 
-    visits: jax.Array  # [N, cells] over the horizon: less than 1 in sum where a run ended early
+    visits: jax.Array  # [N, cells] divided by the horizon: sum below 1 if a run ended early
     state: jax.Array  # [N, T, 2] physics
-    alive: jax.Array  # [N, T] bool: the step was taken before the end, or to it
+    alive: jax.Array  # [N, T] bool: steps up to and including the one that reached the end
 
 
 def mixture_probabilities(
     policies: Policy, weights: jax.Array, size: jax.Array | int, observation: jax.Array
 ) -> jax.Array:
-    """[3]: the first `size` policies' action probabilities, averaged by `weights` [P]."""
+    """Averages the action probabilities of the first `size` policies.
+
+    Args:
+      weights: [P] of the policies.
+      size: [] number of policies in the mixture.
+      observation: [D] observation.
+    Returns:
+      [3] probabilities.
+    """
 
     def add(i, total):
         policy = jax.tree.map(lambda slots: slots[i], policies)
@@ -51,7 +59,7 @@ def mixture_probabilities(
 def play(
     settings: Settings, probabilities: Probabilities, start: jax.Array, key: jax.Array
 ) -> Runs:
-    """`num_runs` from `start` [2], and `num_fresh` from rest."""
+    """Plays `num_runs` runs from `start` [2], and `num_fresh` runs from rest."""
     grid = envs.entry(settings.env).grid
     number = settings.num_runs + settings.num_fresh
     of_reward = jnp.arange(number)[:, None] < settings.num_runs
@@ -65,9 +73,10 @@ def play(
 
 
 def draw_start(settings: Settings, runs: Runs, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """A state [2] of the last run of the reward, at a random time, and whether it was alive then.
+    """Draws the next start [2]: the state of the reward's last run at a random time.
 
-    With `stop_probability` it loses its velocity.
+    With `stop_probability` the state loses its velocity. The second result [] bool says whether the
+    run was alive at that time.
     """
     time, stop = jax.random.uniform(key, (2,))
     moment = jnp.floor(time * settings.horizon).astype(jnp.int32)
@@ -78,21 +87,21 @@ def draw_start(settings: Settings, runs: Runs, key: jax.Array) -> tuple[jax.Arra
 
 
 def rarity(settings: Settings, density: jax.Array) -> jax.Array:
-    """[cells] 1/(p + σ), the next reward: the gradient of Σ log(p + σ).
+    """Returns the next reward [cells], 1/(p + σ) of the density p [cells].
 
-    That is a smoothed divergence of p from equal visits, not the entropy, whose gradient the
-    official code has behind a flag.
+    This is the gradient of Σ log(p + σ), a smoothed divergence of p from equal visits. It is not
+    the gradient of the entropy, which the official code has behind a flag.
     """
     return 1 / (density + settings.smoothing)
 
 
 def pooled_entropy(visits: jax.Array) -> jax.Array:
-    """[] nats: of the visits [N, cells] of the first k runs together, mean over k = 1 ... N."""
+    """Returns the entropy of the first k runs' `visits` [N, cells], mean over k = 1 ... N; nats."""
     return jnp.mean(jax.vmap(histogram.shannon_entropy)(jnp.cumsum(visits, axis=0)))
 
 
 def play_all(settings: Settings, weights: jax.Array, key: jax.Array) -> Metrics:
-    """A run of P rounds, mixed by `weights` [P, P]: fields of Trace, [P, ...]."""
+    """Plays a run of P rounds, mixed by `weights` [P, P]; returns fields of Trace, [P, ...]."""
     grid = envs.entry(settings.env).grid
     policy = jax.eval_shape(lambda: reinforce.init_policy(settings, key))
     state = State(
@@ -152,7 +161,7 @@ def _measure(
     by_chance: jax.Array,
     by_chance_from_start: jax.Array,
 ) -> Metrics:
-    """Of the visits [N, cells] of the mixture, and of the random policy from rest and beside it."""
+    """Measures of the visits [N, cells] of the mixture and of the random policy."""
     mixture, fresh = jnp.split(played, [settings.num_runs])
     random, random_fresh = jnp.split(by_chance, [settings.num_runs])
     random_density = jnp.mean(random, axis=0)

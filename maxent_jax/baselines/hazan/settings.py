@@ -8,20 +8,20 @@ from maxent_jax.envs import mountain_car
 
 
 class Settings(NamedTuple):
-    """Of a run. For a smaller one `_replace` the numbers."""
+    """Settings of a run; `_replace` the numbers for a smaller run."""
 
     env: str
-    num_rounds: int  # P: policies, the first of which is untrained
-    num_episodes: int  # of training, for each of the others; a gradient step each
+    num_rounds: int  # P: policies; the first is untrained
+    num_episodes: int  # of training for each of the other policies, with one gradient step each
     train_steps: int  # in an episode of training
     rest: tuple[float, float]  # physics state at the bottom
     reset_low: tuple[float, float]  # physics state after a plain reset, uniform
     reset_high: tuple[float, float]
     action_scale: float  # share of the environment's torque or engine that an action uses
-    stop_probability: float  # with which the next runs' start loses its velocity
+    stop_probability: float  # that the start of the next runs loses its velocity
     horizon: int = 200  # T: steps of a run
-    num_runs: int = 10  # of the mixture, whose visits make the reward
-    num_fresh: int = 100  # further runs, from rest, which measure and teach nothing
+    num_runs: int = 10  # of the mixture; their visits define the reward
+    num_fresh: int = 100  # further runs from rest, for measurement alone
     hidden_size: int = 128
     learning_rate: float = 1e-3
     discount: float = 0.99
@@ -55,15 +55,15 @@ SETTINGS = {
 
 
 def check(settings: Settings) -> None:
-    """Are these settings of a run?
+    """Checks the settings.
 
     Raises:
-      ValueError: an unknown environment, or a size that is too small.
+      ValueError: the environment is unknown, or a size is too small.
     """
     if settings.env not in SETTINGS:
-        raise ValueError(f"unknown env '{settings.env}': choose of {', '.join(SETTINGS)}")
+        raise ValueError(f"unknown env '{settings.env}': choose from {', '.join(SETTINGS)}")
     least = dict.fromkeys(("num_rounds", "horizon", "num_runs", "num_fresh", "hidden_size"), 1)
-    least |= {"num_episodes": 0, "train_steps": 2}  # one step's return has no deviation
+    least |= {"num_episodes": 0, "train_steps": 2}  # the return of one step has no deviation
     for name, smallest in least.items():
         if getattr(settings, name) < smallest:
             raise ValueError(

@@ -1,12 +1,13 @@
 """MEPOL: one policy, by gradient ascent on the k-nearest-neighbour entropy of the states it visits.
 
-    epoch    a batch of episodes, and steps on it within a trust region (ascent.py), by estimates
-             of what the policy would visit (estimates.py)
-    iterate  epochs, then what the policy reaches
+    epoch    a batch of episodes, and gradient steps on it within a trust region (ascent.py), by
+             estimates of the states that the policy would visit (estimates.py)
+    iterate  epochs, then an evaluation of the policy
 
-The official code lets no episode end before its time limit; here health ends them, and the states
-beyond it count nowhere. It trains the mean of the policy towards 0 before it begins; here it is 0.
-It measures densities over all of the state or its first coordinates; here, as for all methods, φ.
+Three things differ from the official code. There, no episode ends before its time limit; here,
+health termination ends episodes, and the states after it do not count. There, the mean of the
+policy is first trained towards 0; here, it starts at 0. There, densities are measured over the
+whole state or its first coordinates; here, over φ, as for all methods.
 
 Source: Mutti, Pratissoli & Restelli 2021 (arXiv 2007.04640); github.com/muttimirco/mepol.
 """
@@ -40,14 +41,14 @@ class State(NamedTuple):
     policy: Any  # parameters
     optimizer: Any
     starts: base.State  # [R, ...] random starts
-    visits: Visits  # of every episode that was played to learn from
-    env_steps: jax.Array  # [] int32, in the same
-    gradient_steps: jax.Array  # [] int32, the refused ones too
+    visits: Visits  # of all training episodes
+    env_steps: jax.Array  # [] int32, of all training episodes
+    gradient_steps: jax.Array  # [] int32, refused ones included
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def init(components: Components, settings: Settings, key: jax.Array) -> State:
-    """Before the first epoch: a Gaussian of mean 0 in every state."""
+    """Returns the state before the first epoch: the policy is a Gaussian of mean 0 everywhere."""
     key, key_policy, key_starts = jax.random.split(key, 3)
     inputs = components.sac.inputs(jnp.zeros(components.sac.observation_size))
     policy = module(components, settings).init(key_policy, inputs)
@@ -67,13 +68,13 @@ def init(components: Components, settings: Settings, key: jax.Array) -> State:
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def iterate(components: Components, settings: Settings, state: State) -> tuple[State, Metrics]:
-    """So many epochs, and the measures that a mixture gets after an iteration.
+    """Runs `num_epochs` epochs, then measures the policy as a mixture is measured.
 
-    Of seeds side by side: jax.vmap over the state. An epoch takes num_episodes × episode_length env
-    steps where no episode ends early.
+    For several seeds, jax.vmap over the state. An epoch takes num_episodes × episode_length env
+    steps if no episode ends early.
 
     Raises:
-      ValueError: as many neighbours as that, or more.
+      ValueError: num_neighbors is not smaller than that number of env steps.
     """
     state, in_epochs = jax.lax.scan(
         lambda s, _: epoch(components, settings, s), state, length=settings.num_epochs
@@ -88,7 +89,7 @@ def iterate(components: Components, settings: Settings, state: State) -> tuple[S
 
 
 def epoch(components: Components, settings: Settings, state: State) -> tuple[State, Metrics]:
-    """A batch of episodes and the steps on it. Metrics named num_ are counts."""
+    """Plays a batch of episodes and takes steps on it; metrics named num_ are counts."""
     key, key_starts, key_play = jax.random.split(state.key, 3)
     starts = base.draw_starts(state.starts, settings.num_episodes, key_starts)
     played = play(components, settings, state.policy, starts, key_play)
@@ -113,7 +114,7 @@ def epoch(components: Components, settings: Settings, state: State) -> tuple[Sta
     )
     return state, {
         "knn_entropy": played_entropy,
-        "next_knn_entropy": after.entropy,  # of the next policy, by the same states
+        "next_knn_entropy": after.entropy,  # of the next policy, estimated from the same states
         "kl": after.kl,
         "num_updates": num_updates,
         "num_backtracks": after.num_refused,
@@ -126,7 +127,7 @@ def epoch(components: Components, settings: Settings, state: State) -> tuple[Sta
 def play(
     components: Components, settings: Settings, policy: Any, starts: base.State, key: jax.Array
 ) -> Trajectories:
-    """Episodes of the policy from `starts` [E, ...]; their actions are those before clipping."""
+    """Plays episodes of the policy from `starts` [E, ...]; the actions are not yet clipped."""
     network = module(components, settings)
 
     def act(observation, key_step):
@@ -140,7 +141,7 @@ def play(
 def batch_of(
     components: Components, settings: Settings, starts: base.State, played: Trajectories
 ) -> Batch:
-    """What episodes played from `starts` [E, ...] teach."""
+    """Makes the batch from episodes that were played from `starts` [E, ...]."""
     left = jnp.concatenate([starts.obs[None], played.states[:-1]])
     features = components.phi(played.states)
     return Batch(
@@ -151,9 +152,9 @@ def batch_of(
 
 
 def evaluate(components: Components, settings: Settings, state: State) -> Metrics:
-    """The measures of a mixture that is this policy alone, over as many episodes.
+    """Measures the policy like a mixture with this one policy, over as many episodes.
 
-    The same randomness every time; these episodes enter no count.
+    It uses the same randomness every time, and its episodes enter no count.
     """
     key_starts, key_play, key_rows = jax.random.split(jax.random.key(algorithm.EVALUATION_SEED), 3)
     num_episodes = components.config.mixture.mixture_episodes
@@ -167,7 +168,7 @@ def evaluate(components: Components, settings: Settings, state: State) -> Metric
 
 
 def module(components: Components, settings: Settings) -> GaussianPolicy:
-    """The policy's network."""
+    """Returns the policy's network."""
     return GaussianPolicy(
         action_size=components.env.action_size,
         num_layers=settings.hidden_layers,
@@ -177,8 +178,8 @@ def module(components: Components, settings: Settings) -> GaussianPolicy:
 
 
 class Clipped(Wrapper):
-    """An environment to which an action beyond [-1, 1] is its limit."""
+    """An environment that clips actions to [-1, 1]."""
 
     def step(self, state: base.State, action: jax.Array) -> base.State:
-        """One control step, single."""
+        """Takes one control step of one environment with the action [A], clipped."""
         return self.env.step(state, jnp.clip(action, -1.0, 1.0))

@@ -1,4 +1,4 @@
-"""Steps of a policy on one batch, for as long as its states stay near those of the batch."""
+"""Gradient steps of a policy on one batch, while its states stay near those of the batch."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
@@ -12,11 +12,11 @@ from maxent_jax.baselines.mepol.estimates import Particles
 from maxent_jax.baselines.mepol.settings import Settings
 from maxent_jax.sac.networks import GaussianPolicy
 
-ADAM = optax.scale_by_adam()  # the rate changes with every refusal
+ADAM = optax.scale_by_adam()  # ascend applies the rate, which falls with every refused step
 
 
 class Batch(NamedTuple):
-    """What the policy that played left behind."""
+    """Episodes of the policy that played."""
 
     inputs: jax.Array  # [T, E, I] of the state in which each action was drawn
     actions: jax.Array  # [T, E, A] as drawn, not clipped
@@ -24,12 +24,12 @@ class Batch(NamedTuple):
 
 
 class Ascent(NamedTuple):
-    """Where the steps on a batch have led."""
+    """The state of the steps on a batch."""
 
     policy: Any  # the last one accepted
     gradient: Any  # of its entropy
     entropy: jax.Array  # [] nats, of the states that it would visit
-    kl: jax.Array  # [] nats, of those from the batch
+    kl: jax.Array  # [] nats, from the batch's states to its own
     optimizer: Any
     num_accepted: jax.Array  # [] int32
     num_refused: jax.Array  # [] int32
@@ -39,22 +39,26 @@ class Ascent(NamedTuple):
 def ascend(
     module: GaussianPolicy, settings: Settings, policy: Any, optimizer: Any, batch: Batch
 ) -> tuple[Ascent, jax.Array]:
-    """Gradient steps on a batch, and the entropy [] of the states of the policy that played it.
+    """Takes gradient steps on a batch, within the trust region.
 
-    A step that leaves the trust region is refused, and a smaller one is tried from the same policy;
-    the first to be accepted then is the last. Refused steps enter Adam's moments too. The number of
-    attempts is fixed, and those after the end change nothing, so that seeds can run side by side.
+    A step that leaves the trust region is refused, and a smaller step from the same policy is
+    tried. After a refusal, the first accepted step is the last one. Refused steps enter Adam's
+    moments too. The number of attempts is fixed, so that seeds can run in parallel; attempts after
+    the end change nothing.
 
     Args:
-      policy: that played.
-      optimizer: of ADAM.
-    Source: the official code. Algorithm 1 of Mutti et al. 2021 knows neither the backtracking nor a
+      policy: the parameters of the policy that played.
+      optimizer: the state of ADAM.
+    Returns:
+      The last state of the steps, and the entropy [] in nats of the states of the policy that
+      played.
+    Source: the official code. Algorithm 1 of Mutti et al. 2021 has neither the backtracking nor a
     largest number of steps.
     """
     measure = _measures(module, policy, batch)
     (entropy, kl), gradient = measure(policy)
     zero = jnp.zeros((), jnp.int32)
-    # Too few particles: nothing can be learned, and Adam must not see it.
+    # With too few particles nothing can be learned, and Adam must not see the gradient.
     ended = ~jnp.isfinite(entropy)
     begin = Ascent(policy, gradient, entropy, kl, optimizer, zero, zero, ended)
 
@@ -63,7 +67,7 @@ def ascend(
         rate = settings.learning_rate / settings.backtrack_factor**now.num_refused
         tried = jax.tree.map(lambda x, d: x + rate * d, now.policy, direction)
         (entropy, kl), gradient = measure(tried)
-        accepted = jnp.isfinite(entropy) & (kl <= settings.kl_threshold)  # NaN is not
+        accepted = jnp.isfinite(entropy) & (kl <= settings.kl_threshold)  # false for NaN
         num_accepted = now.num_accepted + accepted
         num_refused = now.num_refused + ~accepted
         ended = accepted & (num_refused > 0)
@@ -89,14 +93,14 @@ def ascend(
 
 
 def gaussian(module: GaussianPolicy, policy: Any, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The policy's mean and log standard deviation, [..., I] -> [..., A] each."""
+    """Returns the policy's mean and log standard deviation, [..., I] -> [..., A] each."""
     return cast(tuple[jax.Array, jax.Array], module.apply(policy, inputs))
 
 
 def log_prob(module: GaussianPolicy, policy: Any, batch: Batch) -> jax.Array:
-    """[T, E] nats, of the actions drawn, up to a constant.
+    """Returns the log-probability of the drawn actions up to a constant, [T, E] nats.
 
-    Clipping is the environment's: it sees the same action, whichever policy drew it.
+    It ignores the clipping, which the environment does in the same way for every policy.
     """
     mean, log_std = gaussian(module, policy, batch.inputs)
     noise = (batch.actions - mean) * jnp.exp(-log_std)
@@ -104,7 +108,7 @@ def log_prob(module: GaussianPolicy, policy: Any, batch: Batch) -> jax.Array:
 
 
 def _measures(module: GaussianPolicy, played_by: Any, batch: Batch) -> Callable:
-    """policy -> (entropy, KL from the one that played), and the gradient of the entropy."""
+    """policy -> (entropy, KL from the policy that played), and the gradient of the entropy."""
     played = log_prob(module, played_by, batch)
     particles = batch.particles
 

@@ -1,7 +1,7 @@
-"""What MEPOL knows of a policy that it has not played: entropy and KL from another's particles.
+"""MEPOL's estimates for a policy that has not played: entropy and KL from another's particles.
 
-A particle is a state of a batch. The policy that is asked about gives it the weight with which it
-would have reached it, and every estimate is made of the weights around each particle.
+A particle is a state of a batch. Its importance weight says how likely the new policy would have
+reached it. Every estimate is computed from the weights around each particle.
 
 Source: Mutti, Pratissoli & Restelli 2021, arXiv 2007.04640; Ajgl & Šimandl 2011 for the estimators.
 """
@@ -14,29 +14,31 @@ from jax.scipy.special import digamma
 
 from maxent_jax.density.entropy import log_density
 
-QUERIES_AT_ONCE = 256  # rows of the distance matrix that exist at a time
-MIN_VOLUME = 1e-15  # of a neighbourhood, where particles coincide; the official MountainCar's eps
+QUERIES_AT_ONCE = 256  # rows of the distance matrix that are in memory at a time
+MIN_VOLUME = 1e-15  # of a neighbourhood, if particles coincide; the official MountainCar's eps
 
 
 class Particles(NamedTuple):
     """The R = T·E states of E episodes and their neighbourhoods; fixed while policies are tried."""
 
-    alive: jax.Array  # [T, E] bool: reached before its episode's end, else nothing counts it
-    neighbors: jax.Array  # [R, k] int32, itself and then its k - 1 nearest others
-    log_volume: jax.Array  # [R] of the ball that reaches its k-th nearest other
+    alive: jax.Array  # [T, E] bool: reached before the episode's end; the others do not count
+    neighbors: jax.Array  # [R, k] int32, the particle and then its k - 1 nearest others
+    log_volume: jax.Array  # [R] of the ball that reaches the particle's k-th nearest other
 
 
 def particles(features: jax.Array, alive: jax.Array, k: int) -> Particles:
-    """The states of a batch with their neighbourhoods.
+    """Finds the neighbourhoods of the states of a batch.
 
     Args:
-      features: [T, E, F].
-      alive: [T, E] bool, with more than k true.
-      k: which neighbour the ball reaches.
+      features: [T, E, F] of the states.
+      alive: [T, E] bool, more than k of them true.
+      k: the ball reaches the k-th neighbour.
+    Returns:
+      The particles, R = T·E.
     Raises:
       ValueError: R <= k.
-    Source: the official code. Of the k particles of a ball one is its centre; that on its edge is
-    not among them.
+    Source: the official code. The k particles of a ball include its centre, but not the one on its
+    edge.
     """
     dims = features.shape[-1]
     distance, others = nearest(features.reshape(-1, dims), alive.reshape(-1), k)
@@ -50,14 +52,16 @@ def particles(features: jax.Array, alive: jax.Array, k: int) -> Particles:
 
 
 def nearest(points: jax.Array, alive: jax.Array, k: int) -> tuple[jax.Array, jax.Array]:
-    """The k nearest others of each point, ascending: distances and rows, [R, k] each.
+    """Finds the k nearest others of each point.
 
-    Exact, by direct differences. Memory grows with R.
+    The search is exact, by direct differences. Memory grows with R.
 
     Args:
-      points: [R, F].
-      alive: [R] bool; a point that is not alive is nobody's neighbour.
-      k: neighbours wanted; where there are fewer, the distance is inf.
+      points: [R, F] points.
+      alive: [R] bool; a point that is not alive is no neighbour.
+      k: number of neighbours.
+    Returns:
+      Distances and rows [R, k], in ascending order; a missing neighbour has distance inf.
     Raises:
       ValueError: R <= k.
     """
@@ -77,27 +81,29 @@ def nearest(points: jax.Array, alive: jax.Array, k: int) -> tuple[jax.Array, jax
 
 
 def log_weights(log_ratio: jax.Array, alive: jax.Array) -> jax.Array:
-    """Normalised importance weights of the particles, [R] nats; -inf where not alive.
+    """Returns the logarithms of the particles' normalised importance weights.
 
     The probability of a state is that of all actions of its episode up to it.
 
     Args:
       log_ratio: [T, E] log π'(a|s) - log π(a|s) of the action that led to each state.
-      alive: [T, E] bool.
+      alive: [T, E] bool, as in Particles.
+    Returns:
+      [R] nats; -inf where not alive.
     """
     upto = jnp.cumsum(jnp.where(alive, log_ratio, 0.0), axis=0)
     return jax.nn.log_softmax(jnp.where(alive, upto, -jnp.inf).reshape(-1))
 
 
 def entropy(particles: Particles, log_weight: jax.Array) -> jax.Array:
-    """Differential entropy of the weighted policy's states, [] nats; differentiable in the weights.
+    """Estimates the differential entropy of the new policy's states, [] nats; differentiable.
 
     -Σ_i (W_i / k) log(W_i / V_i) + log k - ψ(k), with W_i the weight of the k particles in the ball
-    around particle i and V_i its volume. With equal weights it is density.entropy.knn_entropy with
-    N in the place of N - 1.
+    around particle i and V_i its volume. With equal weights this is density.entropy.knn_entropy
+    with N in place of N - 1.
 
     Args:
-      log_weight: [R] of log_weights.
+      log_weight: [R] from `log_weights`.
     """
     k = particles.neighbors.shape[1]
     alive = particles.alive.reshape(-1)
@@ -107,12 +113,12 @@ def entropy(particles: Particles, log_weight: jax.Array) -> jax.Array:
 
 
 def kl(particles: Particles, log_weight: jax.Array) -> jax.Array:
-    """KL(d_π ‖ d_π'), of the policy that played and the weighted one, [] nats.
+    """Estimates KL(d_π ‖ d_π') from the policy that played to the new one, [] nats.
 
-    The mean over the N particles of log(k / (N W_i)), and 0 where that is negative.
+    This is the mean over the N particles of log(k / (N W_i)), or 0 if that is negative.
 
     Args:
-      log_weight: [R] of log_weights.
+      log_weight: [R] from `log_weights`.
     """
     k = particles.neighbors.shape[1]
     alive = particles.alive.reshape(-1)
@@ -122,7 +128,7 @@ def kl(particles: Particles, log_weight: jax.Array) -> jax.Array:
 
 
 def _log_mass(particles: Particles, log_weight: jax.Array) -> jax.Array:
-    """[R] log W_i, 0 where not alive. In logarithms: float32 holds no ratio of 1,000 actions."""
+    """[R] log W_i, 0 where not alive; float32 cannot hold the ratio itself for 1,000 actions."""
     around = log_weight[particles.neighbors]
     alive = particles.alive.reshape(-1, 1)
     return jax.nn.logsumexp(jnp.where(alive, around, -jnp.log(around.shape[1])), axis=1)

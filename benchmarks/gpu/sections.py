@@ -1,32 +1,18 @@
-"""What does a GPU make of it? Two parts of at most five minutes each, the most valuable first.
+"""The sections. Each begins to compile when called, and returns the function that measures."""
 
-`--part first`: the device; nearest neighbours; Ant's env steps; MaxEnt-V on Ant, end to end, as the
-command `train`. `--part second`: Walker2d and Humanoid; gradient steps, one seed and eight side by
-side; MJX beside C MuJoCo; the longest kernels of training. All programs of a part are compiled at
-the same time, and what they took is said apart. A row joins OUT/PART.jsonl as soon as it is
-measured: when its time is up a part ends where it is, with the rows that it has. No network is
-needed.
-"""
-
-import argparse
 import contextlib
 import functools
 import gzip
 import itertools
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
 import sys
-import tarfile
-import tempfile
 import time
-import traceback
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,16 +20,14 @@ import numpy as np
 
 import benchmarks.envs
 from benchmarks import common, knn, sac
+from benchmarks.gpu.session import Measure, Row, Session
 from maxent_jax import algorithm, envs, native
 from maxent_jax.algorithm.experience import Reference
 from maxent_jax.config import Config, preset
 from maxent_jax.envs import base
-from maxent_jax.runs import files, runtime
+from maxent_jax.runs import files
 
-SECONDS = 300.0  # of a part
-PACKING = 5.0  # seconds of these, to pack what there is
-EVALUATION = 0.2  # share of these, to stop the run and to play its policies on the host
-NOT_PACKED = {"checkpoints", "trace"}
+EVALUATION = 0.2  # share of the time, to stop the run and to play its policies on the host
 ENVS = (4096, 16_384)
 RATE_STEPS = 20  # of each environment, in one program
 KNN_SIZES = ((100_000, 100_000), (64, 65_536))  # queries, points
@@ -53,64 +37,9 @@ UPDATES = 100
 TRACE_STEPS = 2  # vector steps of training in the trace
 NUM_KERNELS = 10
 
-Row = dict[str, Any]
-# A section begins to compile what it needs when it is called; what it returns measures.
-Measure = Callable[[], Iterator[Row]]
-
-
-class Session(NamedTuple):
-    """What the sections of a part share."""
-
-    toy: bool
-    deadline: float  # time.monotonic()
-    work: Path
-    compilers: ThreadPoolExecutor
-    running: list[subprocess.Popen]  # runs of training beside this process
-
-    def compile(self, name: str, function: Callable, *args: Any) -> "Future[Compiled]":
-        """Begins at once, beside all others."""
-        return self.compilers.submit(_compile, name, function, *args)
-
-    @contextlib.contextmanager
-    def alone(self) -> Iterator[None]:
-        """Holds the runs beside this process, which compile meanwhile, while something is timed."""
-        alive = [run for run in self.running if run.poll() is None]
-        for run in alive:
-            run.send_signal(signal.SIGSTOP)
-        try:
-            yield
-        finally:
-            for run in alive:
-                run.send_signal(signal.SIGCONT)
-
-
-class Compiled(NamedTuple):
-    """A program, and what it took to have it."""
-
-    call: Callable
-    row: Row
-
-
-def _compile(name: str, function: Callable, *args: Any) -> Compiled:
-    started = time.perf_counter()
-    lowered = jax.jit(function).lower(*args)
-    traced = time.perf_counter()
-    program = lowered.compile()
-    row = {
-        "section": "compiled",
-        "program": name,
-        "programs": 1,
-        "trace_seconds": traced - started,
-        "compile_seconds": time.perf_counter() - traced,
-    }
-    memory = program.memory_analysis()
-    if memory is not None:  # not every backend knows
-        row["temporary_gigabytes"] = memory.temp_size_in_bytes / 1e9
-    return Compiled(program, row)
-
 
 def device(session: Session) -> Measure:
-    """Versions and memory, what a large matmul reaches, and whether it rounds its factors."""
+    """Measures the rate of a large matmul and whether it rounds its factors; prints versions."""
 
     def measure() -> Iterator[Row]:
         common.print_versions()
@@ -130,7 +59,7 @@ def device(session: Session) -> Measure:
 
 
 def neighbors(session: Session) -> Measure:
-    """Ours, in XLA and where it was built in CUDA, beside the expanded square with top_k."""
+    """Measures our search, in XLA and in CUDA if built, and the expanded square with top_k."""
 
     def scan(search, queries, points):
         step = lambda carry, queries: (carry, search(queries, points))
@@ -146,7 +75,7 @@ def neighbors(session: Session) -> Measure:
         queries = rows[: num_sets * num_queries].reshape(num_sets, num_queries, -1)
         points = rows[-num_points:]
         for who, search in searches.items():
-            # All squares of the large problem would take 40 GB: what one writes first, in parts.
+            # All squares of the large problem would take 40 GB, so top_k gets its queries in parts.
             parted = queries
             if search is knn.top_k and num_sets == 1 and num_queries > 1000:
                 parted = queries.reshape(-1, 1000, queries.shape[-1])
@@ -179,7 +108,7 @@ def neighbors(session: Session) -> Measure:
 
 
 def torch_seconds(torch: Any, queries: np.ndarray, points: np.ndarray) -> float:
-    """Of a search by cdist and topk, the best of three."""
+    """Returns the best time of three searches by cdist and topk."""
     where = "cuda" if torch.cuda.is_available() else "cpu"
     queries, points = (torch.from_numpy(x).to(where) for x in (queries, points))
     seconds = []
@@ -194,7 +123,7 @@ PEERS = (common.Peer("torch", "torch", torch_seconds),)
 
 
 def peers(session: Session) -> Measure:
-    """What users of a GPU have at hand."""
+    """Measures searches of other libraries."""
     num_queries, num_points = (64, 512) if session.toy else (4096, 65_536)
 
     def measure() -> Iterator[Row]:
@@ -217,7 +146,7 @@ def peers(session: Session) -> Measure:
 
 
 def env_steps(names: tuple[str, ...], sizes: tuple[int, ...], session: Session) -> Measure:
-    """Env steps a second under random actions, episodes started anew as in training."""
+    """Measures env steps per second under random actions, with new episodes as in training."""
     chosen = [("pendulum", 8)] if session.toy else [(n, s) for n in names for s in sizes]
     programs = []
     for name, num_envs in chosen:
@@ -262,8 +191,9 @@ def env_steps(names: tuple[str, ...], sizes: tuple[int, ...], session: Session) 
 
 
 def training(session: Session) -> Measure:
-    """MaxEnt-V on Ant, as the command `train` runs it, until its time is up; then its policies are
-    played on C MuJoCo on the host's cores, and drawn.
+    """Trains MaxEnt-V on Ant with the command `train` until its time is up.
+
+    Then plays its policies on C MuJoCo on the host's cores, and draws them.
     """
     directory = session.work / "ant"
     settings = ["--preset", "gpu", "--env", "ant"]
@@ -308,7 +238,7 @@ def training(session: Session) -> Measure:
             time.sleep(0.2)
         if not reported:
             said = (session.work / "train.log").read_text(encoding="utf-8").splitlines()
-            raise RuntimeError(f"no iteration ended; the run said: {' '.join(said[-1:])}")
+            raise RuntimeError(f"no iteration ended; the run printed: {' '.join(said[-1:])}")
         evaluate = (sys.executable, "-m", "experiments.evaluate", str(directory), "--episodes", "3")
         with open(session.work / "evaluate.log", "w", encoding="utf-8") as of_evaluate:
             subprocess.run(
@@ -334,7 +264,7 @@ def training(session: Session) -> Measure:
 
 
 def updates(session: Session) -> Measure:
-    """Gradient steps of the actor and both critics, all seeds together."""
+    """Measures gradient steps of the actor and both critics, of all seeds together."""
     hidden, batches, number = (16, (8,), 4) if session.toy else (256, BATCHES, UPDATES)
     programs = []
     for batch, seeds in itertools.product(batches, SEEDS):
@@ -363,7 +293,7 @@ def updates(session: Session) -> Measure:
 
 
 def fidelity(session: Session) -> Measure:
-    """MJX with the reference options beside C MuJoCo, from the same states, the same actions."""
+    """Compares MJX with the reference options and C MuJoCo: same states, same actions."""
     num_envs, num_steps = (2, 2) if session.toy else (256, 50)
     backend = "mujoco" if session.toy else "mjx"
     with jax.default_device(jax.devices("cpu")[0]):
@@ -396,7 +326,7 @@ def fidelity(session: Session) -> Measure:
 
 
 def kernels(session: Session) -> Measure:
-    """Which kernels a step of training spends its time in, by the profiler."""
+    """Profiles a step of training: the kernels in which it spends its time."""
     settings: Row = {"random_baseline": False, "num_segments": 1}
     if session.toy:
         config = preset("smoke", env="pendulum", **settings)
@@ -444,9 +374,9 @@ def kernels(session: Session) -> Measure:
 
 
 def longest(folder: Path) -> list[tuple[float, int, str]]:
-    """Seconds, calls and name of each kernel of a profile, the longest first.
+    """Returns seconds, calls and name of each kernel of a profile, longest first.
 
-    On a GPU the events of its streams; on a CPU those that name an instruction of the program.
+    On a GPU these are the events of its streams, on a CPU those that name an instruction.
     """
     path = max(folder.glob("plugins/profile/*/*.trace.json.gz"))
     with gzip.open(path, "rt", encoding="utf-8") as file:
@@ -468,142 +398,3 @@ def longest(folder: Path) -> list[tuple[float, int, str]]:
         seconds_and_calls[0] += event["dur"] / 1e6
         seconds_and_calls[1] += 1
     return sorted(((s, int(n), name) for name, (s, n) in totals.items()), reverse=True)
-
-
-# All begin to compile together; what stands first is measured first.
-PARTS: dict[str, dict[str, Callable[[Session], Measure]]] = {
-    "first": {
-        "device": device,
-        "neighbors": neighbors,
-        "env steps": functools.partial(env_steps, ("ant",), ENVS),
-        "training": training,
-    },
-    "second": {
-        "env steps": functools.partial(env_steps, ("walker2d", "humanoid"), ENVS[:1]),
-        "updates": updates,
-        "fidelity": fidelity,
-        "kernels": kernels,
-        "peers": peers,
-    },
-}
-
-
-def measure(part: str, seconds: float, toy: bool, rows: Path, work: Path) -> None:
-    """In a process of its own, which may be ended at any time."""
-    os.setpgrp()  # it ends together with the compilers and the runs that it starts
-    # Two processes share the device: a part, and the run of `training` beside it.
-    os.environ["XLA_PYTHON_CLIENT_MEM_FRACTION"] = "0.45"
-    runtime.prepare(simulates_in_jax=True)
-    began = time.monotonic()
-    with ThreadPoolExecutor(max_workers=16) as compilers, rows.open("a", encoding="utf-8") as file:
-        session = Session(toy, began + seconds, work, compilers, [])
-
-        def write(row: Row) -> None:
-            row = common.rounded({"after_seconds": time.monotonic() - began} | row)
-            print(json.dumps(row), file=file, flush=True)
-            common.progress(row)
-
-        def failed(what: str, error: Exception) -> None:  # costs what it would have measured
-            traceback.print_exception(error)
-            write({"section": "failed", "what": what, "why": common.sentence(error)})
-
-        begun = {name: compilers.submit(s, session) for name, s in PARTS[part].items()}
-        for name, section in begun.items():
-            try:
-                measure_section = section.result()
-                for row in measure_section():
-                    write(row)
-            except Exception as error:
-                failed(name, error)
-
-
-def run_part(part: str, seconds: float, toy: bool, out: Path) -> list[Row]:
-    """The rows of a part that ends when its time is up, packed into OUT/PART.*"""
-    until = time.monotonic() + seconds
-    rows = out / f"{part}.jsonl"
-    rows.unlink(missing_ok=True)
-    with tempfile.TemporaryDirectory() as folder:
-        work = Path(folder)
-        arguments = part, seconds - PACKING, toy, rows, work
-        process = multiprocessing.get_context("spawn").Process(target=measure, args=arguments)
-        process.start()
-        assert process.pid is not None
-        try:
-            process.join(until - PACKING - time.monotonic())
-            ended = process.exitcode  # None: its time is up
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-        process.join()
-        with tarfile.open(out / f"{part}.tar.gz", "w:gz") as archive:
-            for path in sorted(work.rglob("*")):
-                name = path.relative_to(work)
-                if path.is_file() and not NOT_PACKED & set(name.parts):
-                    archive.add(path, name)
-    # A row that was being written when the time was up is none.
-    written = rows.read_text(encoding="utf-8") if rows.exists() else ""
-    whole = written[: written.rfind("\n") + 1]
-    rows.write_text(whole, encoding="utf-8")
-    found = [json.loads(line) for line in whole.splitlines()]
-    if ended:
-        found.append({"section": "failed", "what": part, "why": f"it ended with code {ended}"})
-    return found
-
-
-def summary(rows: list[Row]) -> list[str]:
-    """A line for each figure that matters, ten at most: failures first."""
-    compiled = [row for row in rows if row["section"] == "compiled"]
-    programs = sum(row["programs"] for row in compiled)
-    seconds = sum(row.get("trace_seconds", 0) + row["compile_seconds"] for row in compiled)
-    lines = [f"{programs} programs compiled, {seconds:.0f} s, side by side"]
-    for section, line in SUMMARY.items():
-        lines += filter(None, (line(row) for row in rows if row["section"] == section))
-    return lines[:10]
-
-
-SUMMARY: dict[str, Callable[[Row], str]] = {
-    "failed": lambda r: f"failed: {r['what']} ({r['why']})",
-    "env steps": lambda r: (
-        f"{r['env']}, {r['envs']:,} envs: {r['env_steps_per_second']:,.0f} env steps/s"
-    ),
-    "played": lambda r: (
-        f"MaxEnt-V: {r['iterations']} iterations, {r['cells']:,} cells in training, "
-        f"{r['mixture_cells']:,} by the mixture on C MuJoCo, {r['mixture_nats']:.2f} nats"
-    ),
-    "kNN": lambda r: (
-        f"kNN, {r['who']}, {r['queries']:,} x {r['points']:,}: {r['tpair_per_second']:.3g} Tpair/s"
-    ),
-    "updates": lambda r: (
-        f"SAC, batch {r['batch_size']:,}, seeds {r['seeds']}: {r['updates_per_second']:,.0f} "
-        f"updates/s, {r['over_one_seed']:.2f} times one seed's"
-    ),
-    "kernels": lambda r: (
-        ""
-        if "kernel" in r
-        else f"training: {r['kernels'] / r['vector_steps']:,.0f} kernels a vector step, "
-        f"{r['in_kernels_seconds'] / r['wall_seconds']:.0%} of the time in them"
-    ),
-    "fidelity": lambda r: (
-        f"MJX beside C MuJoCo after one step: {r['largest_error_after_1_step']:.1e} at most"
-    ),
-}
-
-
-def main() -> None:
-    flags = argparse.ArgumentParser(description=__doc__)
-    flags.add_argument("--part", choices=list(PARTS), required=True)
-    flags.add_argument("--seconds", type=float, default=SECONDS, help="by this command's own clock")
-    flags.add_argument("--out", type=Path, default=Path("results/gpu"), help="of rows and figures")
-    flags.add_argument("--toy", action="store_true", help="does it run? tiny sizes, on a CPU")
-    args = flags.parse_args()
-    if args.seconds <= PACKING:
-        flags.error(f"--seconds must be more than {PACKING:.0f}.")
-    args.out.mkdir(parents=True, exist_ok=True)
-    rows = run_part(args.part, args.seconds, args.toy, args.out)
-    print("\n".join(summary(rows)))
-    if any(row["section"] == "failed" for row in rows):
-        sys.exit(1)
-
-
-if __name__ == "__main__":
-    main()

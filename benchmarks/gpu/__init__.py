@@ -1,0 +1,1 @@
+"""How fast is everything on a GPU? See __main__.py."""
