@@ -1,4 +1,4 @@
-"""A run, loaded to be looked at: its columns, features, policies elsewhere, paths, the notebook."""
+"""A run, loaded for analysis: its columns, features, exported policies and paths."""
 
 import dataclasses
 import json
@@ -9,10 +9,8 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
-import nbformat
 import numpy as np
 import pytest
-from nbclient import NotebookClient
 from untrained import make_run
 
 import maxent_jax
@@ -24,14 +22,11 @@ from maxent_jax.errors import ConfigError
 from maxent_jax.moments import Moments
 from maxent_jax.runs import files
 
-ROOT = Path(__file__).parent.parent
-NOTEBOOK = ROOT / "docs" / "analysis.ipynb"
-
 
 @pytest.fixture(scope="module")
 def directory(smoke_run, tmp_path_factory):
-    """Where the notebook looks for it, seen from a folder beside."""
-    return Path(shutil.copytree(smoke_run, tmp_path_factory.mktemp("work") / "runs" / "ant"))
+    """A copy, because `evaluate` writes into it."""
+    return Path(shutil.copytree(smoke_run, tmp_path_factory.mktemp("runs") / "ant"))
 
 
 @pytest.fixture(scope="module")
@@ -165,25 +160,3 @@ def test_evaluate_says_where_gymnasium_has_no_such_environment(tmp_path):
     (tmp_path / "checkpoints" / "1").mkdir(parents=True)
     with pytest.raises(ConfigError, match="pendulum is not played in Gymnasium"):
         evaluate.main([str(tmp_path), "--gymnasium"])
-
-
-@pytest.mark.slow
-def test_the_notebook_runs(directory):
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
-    folder = directory.parent.parent / "docs"
-    folder.mkdir()
-    client = NotebookClient(notebook, timeout=600, resources={"metadata": {"path": str(folder)}})
-    client.execute()
-    assert not [o for o in outputs(notebook) if o.get("name") == "stderr" or "ename" in o]
-
-
-def test_the_notebook_shows_what_it_printed():
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
-    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    assert [cell.execution_count for cell in code] == [*range(1, len(code) + 1)]
-    assert sum("image/png" in o.get("data", {}) for o in outputs(notebook)) >= 3
-    assert NOTEBOOK.stat().st_size < 400_000
-
-
-def outputs(notebook):
-    return [o for cell in notebook.cells if cell.cell_type == "code" for o in cell.outputs]

@@ -45,6 +45,8 @@ def test_the_readme_is_read_in_a_minute():
 @every_page
 def test_commands_exist_with_their_flags(page):
     for folder, name, ours, rest in COMMAND.findall(page.read_text()):
+        if name == "NAME" or ours == "NAME":  # a placeholder
+            continue
         if folder == "benchmarks":
             path = ROOT / "benchmarks" / name.replace(".", "/")
             files = path.glob("*.py") if path.is_dir() else [path.with_suffix(".py")]
