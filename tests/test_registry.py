@@ -7,8 +7,11 @@ from pathlib import Path
 
 import pytest
 
+import maxent_jax
+from maxent_jax import components, envs
 from maxent_jax.commands import evaluate, train
 from maxent_jax.config import preset, registry
+from maxent_jax.envs.pendulum import Pendulum
 from maxent_jax.errors import ConfigError, ConfigTypeError, UsageError
 
 MODULE = Path(__file__).parent / "user_module.py"
@@ -97,3 +100,22 @@ def test_an_unknown_setting_of_a_method_is_refused_where_it_is_used(restored_tab
     registry.register_method("mine", "last", 0, "mixture", "last", etta=0.5)
     with pytest.raises(ConfigTypeError, match="unknown setting 'etta': did you mean 'eta'"):
         preset("smoke", method="user:mine")
+
+
+def test_what_programs_were_made_of_cannot_be_replaced(restored_tables):
+    make = lambda backend, physics: Pendulum()
+    for _ in range(2):  # before it is used it may be replaced
+        envs.register("replaced", make)
+    components.make(preset("smoke", env="user:replaced"))
+    with pytest.raises(ConfigError, match="'user:replaced' is already in use in this process"):
+        envs.register("replaced", make)
+
+
+def test_a_run_is_trained_and_loaded_by_one_function(tmp_path):
+    config = preset("smoke", env="pendulum", num_iterations=1)
+    run = maxent_jax.train(config, tmp_path / "run")
+    assert run.num_policies == 2 and (tmp_path / "run" / "figures" / "curves.png").exists()
+    with pytest.raises(UsageError, match="already exists"):
+        maxent_jax.train(config, tmp_path / "run")
+    again = maxent_jax.train(config, tmp_path / "run", resume=True)
+    assert again.metrics["env_steps"] == run.metrics["env_steps"] == [400]

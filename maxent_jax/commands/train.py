@@ -14,13 +14,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from maxent_jax import errors
+from maxent_jax.checks import check_path
 from maxent_jax.commands import cli
-from maxent_jax.config import Config, preset
+from maxent_jax.config import Config, preset, registry
 from maxent_jax.runs import files, runtime
 from maxent_jax.runs.claim import Claim
 from maxent_jax.runs.loggers import Sinks
 
 if TYPE_CHECKING:
+    from maxent_jax.analysis import Run
     from maxent_jax.runs.driver import Options
 from maxent_jax.visual import headless
 
@@ -196,6 +198,36 @@ def main(argv: Sequence[str]) -> None:
         _point_onward(arguments.directory)
 
 
+def train(config: Config, out: str | Path, resume: bool = False, overwrite: bool = False) -> "Run":
+    """Trains a run in this process, draws its figures and loads it, as the command `train` does.
+
+    Progress goes to standard error.
+
+    Args:
+      config: the settings, for example `preset("quick", env="pendulum")`.
+      out: the run's directory.
+      resume: continue the run in the directory from its last checkpoint; start without one.
+      overwrite: remove the run that the directory holds, and start again.
+    Returns:
+      The finished run; of several seeds, the first (see `load_run`).
+    Raises:
+      UsageError, RunError: the directory is not free, or holds a run with other settings.
+      ConfigError: the settings do not fit this machine.
+      NonFiniteError: training produced a number that is not finite.
+      Interrupted: a signal arrived, and the run is saved.
+    """
+    from maxent_jax.analysis import load_run
+    from maxent_jax.runs import driver
+
+    started, directory = time.perf_counter(), check_path("out", out)
+    claim = Claim(directory, config, resume, overwrite)
+    claim.check()
+    driver.check(config)
+    with claim.hold():
+        run_to_end(config, directory, started, driver.AS_USUAL)
+    return load_run(directory)
+
+
 def run_to_end(config: Config, directory: Path, started: float, options: "Options") -> None:
     """Trains the rest of the run and draws its figures; see `driver.train`."""
     from maxent_jax.runs import driver, hosts  # loads jax
@@ -214,7 +246,12 @@ def _print_figures(directory: Path) -> None:
 
 def _point_onward(directory: Path) -> None:
     """Prints what a user can type next."""
-    what = shlex.quote(str(directory))
+    what = " ".join(map(shlex.quote, [str(directory), *_imports()]))
     print("next:")
     for name in ("evaluate", "render", "report"):
         print(f"  {cli.spelled(name) + ' ' + what:60} # {cli.COMMANDS[name]}")
+
+
+def _imports() -> list[str]:
+    """The flags that import the same modules."""
+    return [word for name in registry.imported for word in ("--import", name)]

@@ -127,6 +127,8 @@ _REGISTERED_BY = {
     "method": "maxent_jax.config.register_method",
 }
 
+in_use: set[str] = set()
+"""Names of environments and bonuses that programs of this process were made of."""
 imported: list[str] = []
 """The modules that `import_modules` imported, as the user named them."""
 
@@ -168,9 +170,17 @@ def bonus(name: str) -> BonusRow:
 
 
 def check_name(kind: str, name: Any) -> None:
-    """Raises ConfigTypeError unless the name is a non-empty string."""
+    """Raises ConfigError unless something can be registered under the name.
+
+    What a program of this process was made of cannot change: the program would stay as it is.
+    """
     if not isinstance(name, str) or not name:
         raise ConfigTypeError(f"the {kind}'s name is {name!r}, but must be a non-empty string.")
+    if f"{USER}{name}" in in_use:
+        raise ConfigError(
+            f"{kind} '{USER}{name}' is already in use in this process: choose another name, or "
+            f"restart Python."
+        )
 
 
 def register_environment(name: str, row: EnvironmentRow) -> None:

@@ -93,6 +93,7 @@ def register(
       phi: the feature map, [..., D] -> [..., F], with `.names`; by default the observation's first
         two entries and five random projections of the others.
     Raises:
+      ConfigError: the name is already in use in this process.
       ConfigTypeError (a ValueError and a TypeError): an argument has the wrong type or form.
     """
     registry.check_name("environment", name)

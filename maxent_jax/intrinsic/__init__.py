@@ -20,6 +20,7 @@ def register(name: str, make: Callable[[Setting], Bonus], num_neighbors: int = 0
       make: Setting -> Bonus.
       num_neighbors: k of a bonus that compares the states of a batch; a batch must be larger.
     Raises:
+      ConfigError: the name is already in use in this process.
       ConfigTypeError (a ValueError and a TypeError): an argument has the wrong type or form.
     """
     registry.check_name("bonus", name)

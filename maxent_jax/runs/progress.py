@@ -39,10 +39,13 @@ def announce(config: Config, directory: Path, iterations_done: int) -> None:
     last = c.seed + c.num_seeds - 1
     seeds = f"seed {c.seed}" if c.num_seeds == 1 else f"seeds {c.seed} to {last}"
     env_steps = c.num_seeds * c.budget.num_iterations * c.budget.steps_per_iteration
+    iterations = (
+        "1 iteration" if c.budget.num_iterations == 1 else f"{c.budget.num_iterations} iterations"
+    )
     done = f", {iterations_done} of them done" if iterations_done else ""
     say(
         f"{c.method} on {c.env}, preset {c.preset}, {seeds}: "
-        f"{c.budget.num_iterations} iterations{done}, {env_steps:,} env steps, into {directory}\n"
+        f"{iterations}{done}, {env_steps:,} env steps, into {directory}\n"
         f"compiling, about {COMPILING[c.simulates_in_jax]}, less if programs are cached; "
         f"Ctrl-C saves the run"
     )
