@@ -222,6 +222,7 @@ def train(config: Config, out: str | Path, resume: bool = False, overwrite: bool
     started, directory = time.perf_counter(), check_path("out", out)
     claim = Claim(directory, config, resume, overwrite)
     claim.check()
+    runtime.prepare(config.simulates_in_jax)
     driver.check(config)
     with claim.hold():
         run_to_end(config, directory, started, driver.AS_USUAL)
@@ -247,9 +248,11 @@ def _print_figures(directory: Path) -> None:
 def _point_onward(directory: Path) -> None:
     """Prints what a user can type next."""
     what = " ".join(map(shlex.quote, [str(directory), *_imports()]))
+    commands = {name: f"{cli.spelled(name)} {what}" for name in ("evaluate", "render", "report")}
+    width = max(map(len, commands.values()))
     print("next:")
-    for name in ("evaluate", "render", "report"):
-        print(f"  {cli.spelled(name) + ' ' + what:60} # {cli.COMMANDS[name]}")
+    for name, command in commands.items():
+        print(f"  {command:{width}}  # {cli.COMMANDS[name]}")
 
 
 def _imports() -> list[str]:

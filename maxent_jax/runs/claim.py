@@ -42,8 +42,8 @@ class Claim(NamedTuple):
             files.check_resumable(directory)
         elif not self.overwrite:
             raise UsageError(
-                f"{directory} already exists: choose another --out, or add --resume to continue it "
-                f"or --overwrite to start again."
+                f"{directory} already exists: choose another directory, or continue it (--resume) "
+                f"or start again in it (--overwrite)."
             )
         elif not files.is_config(directory / files.CONFIG):
             raise UsageError(
