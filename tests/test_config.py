@@ -112,3 +112,16 @@ def test_choices_are_those_of_the_modules_that_make_them():
     for row in registry.BONUSES.values():
         assert callable(registry.resolve(row.make))
     assert set(names.REWARDS) == set(rewards.FORMS)
+
+
+@pytest.mark.parametrize(
+    ("changes", "title"),
+    [
+        (dict(method="la"), "MaxEnt-LA"),
+        (dict(method="rnd"), "rnd"),
+        (dict(method="h-official"), "h-official"),
+        (dict(method="v", bonus="rnd"), "MaxEnt-V with bonus rnd"),
+    ],
+)
+def test_titles_name_the_method_and_a_bonus_set_apart_from_it(changes, title):
+    assert preset("smoke", env="pendulum", **changes).title == title

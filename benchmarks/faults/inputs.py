@@ -83,8 +83,8 @@ MISTAKES = (
     train("--out {foreign} --overwrite", "left alone"),
     train("--out {newer} --resume", "schema 99"),
     train("--preset smoke --seed 7 --out {run} --resume", "seed was 0 and is 7"),
-    Mistake("experiments.train", "--wandb project", "maxent_jax[log]", without="wandb"),
-    Mistake("experiments.train", "--tensorboard", "maxent_jax[log]", without="tensorboardX"),
+    Mistake("experiments.train", "--wandb project", "pip install wandb", without="wandb"),
+    Mistake("experiments.train", "--tensorboard", "pip install tensorboardX", without="tensorboardX"),
     Mistake("experiments.evaluate", "{missing}", "not the directory of a run"),
     Mistake("experiments.evaluate", "{run} --episodes 0", "at least 1"),
     Mistake("experiments.evaluate", "{newer}", "schema 99"),
@@ -93,7 +93,7 @@ MISTAKES = (
     Mistake("experiments.render", "{pendulum}", "cannot be drawn"),
     Mistake("experiments.render", "{run} --size 3", "--size must be"),
     Mistake("experiments.render", "{run} --policy 9", "the run has policies 0 to 2"),
-    Mistake("experiments.render", "{run}", "maxent_jax[render]", without="imageio_ffmpeg"),
+    Mistake("experiments.render", "{run}", "pip install imageio-ffmpeg", without="imageio_ffmpeg"),
     Mistake(
         "experiments.render", "{run}", "MUJOCO_GL is 'gles'", environment=("MUJOCO_GL", "gles")
     ),

@@ -221,6 +221,20 @@ class Config(_Checked):
         """Whether MJX or brax computes the physics, as far as is known before jax is loaded."""
         return self.environment.backend == "mjx" or self.env.startswith("brax:")
 
+    @property
+    def own_bonus(self) -> str:
+        """ " with bonus NAME" if the bonus is set apart from the method, else nothing."""
+        bonus = self.intrinsic.bonus
+        known = registry.METHODS.get(self.method)
+        of_method = "none" if known is None else known.settings.get("bonus", "none")
+        return "" if bonus == of_method else f" with bonus {bonus}"
+
+    @property
+    def title(self) -> str:
+        """The method for titles, with its bonus if that is set apart from the method."""
+        name = f"MaxEnt-{self.method.upper()}" if self.method in ("h", "la", "v") else self.method
+        return name + self.own_bonus
+
     def flat(self) -> dict[str, Any]:
         """Returns every setting by name, without groups. No two groups share a name."""
         return {name: self[name] for name in DEFAULTS}

@@ -256,10 +256,11 @@ def measures(components: Components, occupancy: Occupancy, key: jax.Array) -> Me
     cells = histogram.count(occupancy.states, components.grid, occupancy.weight)
     rows = mixture.draw_rows(occupancy.weight, config.mixture.reference_size, key)
     sample = occupancy.features[rows]
+    off_grid = histogram.cells(occupancy.states, components.grid) == components.grid.num_cells
     return {
         "mixture_coverage": histogram.coverage(cells),
         "mixture_entropy": histogram.shannon_entropy(cells),
-        "mixture_off_grid_share": jnp.maximum(1 - jnp.sum(cells), 0.0),  # rounding
+        "mixture_off_grid_share": jnp.sum(jnp.where(off_grid, occupancy.weight, 0.0)),
         "mixture_knn_entropy": entropy.knn_entropy(
             sample, config.intrinsic.num_neighbors, labels=rows
         ),

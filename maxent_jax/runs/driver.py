@@ -198,8 +198,10 @@ def _summarise(config: Config, directory: Path, rows: list[dict[str, Any]]) -> N
     random = ""
     if "random_coverage" in last:
         random = f" (a random policy: {np.mean(last['random_coverage']):,.0f})"
+    played = np.count_nonzero(np.atleast_2d(last["mixture_weights"])[0])
+    who = "the last policy" if played == 1 else f"the mixture of {played} policies"
     print(
         f"{directory}: training visited {np.mean(last['cumulative_coverage']):,.0f} of {cells:,} "
-        f"cells{random}; the mixture of {config.archive_size} policies "
+        f"cells{random}; {who} "
         f"visits {np.mean(last['mixture_coverage']):,.0f} cells; {duration(last['wall_seconds'])}."
     )

@@ -33,8 +33,7 @@ class Sinks(NamedTuple):
         ):
             if asked and importlib.util.find_spec(package) is None:
                 raise UsageError(
-                    f"--{flag} needs {package}, which is not installed: "
-                    f'pip install "maxent_jax[log]".'
+                    f"--{flag} needs {package}, which is not installed: pip install {package}."
                 )
 
     @contextlib.contextmanager

@@ -44,7 +44,7 @@ def announce(config: Config, directory: Path, iterations_done: int) -> None:
     )
     done = f", {iterations_done} of them done" if iterations_done else ""
     say(
-        f"{c.method} on {c.env}, preset {c.preset}, {seeds}: "
+        f"{c.method}{c.own_bonus} on {c.env}, preset {c.preset}, {seeds}: "
         f"{iterations}{done}, {env_steps:,} env steps, into {directory}\n"
         f"compiling, about {COMPILING[c.simulates_in_jax]}, less if programs are cached; "
         f"Ctrl-C saves the run"

@@ -210,9 +210,7 @@ def _name_axes(ax: Axes, run: Run) -> None:
 def _finish(figure: Figure, run: Run) -> Figure:
     """Adds a title and, below, every departure from the paper by name."""
     config = run.config
-    figure.suptitle(
-        f"MaxEnt-{config.method.upper()}, {config.env}, preset {config.preset}, seed {run.seed}"
-    )
+    figure.suptitle(f"{config.title}, {config.env}, preset {config.preset}, seed {run.seed}")
     named = ", ".join(f"{name}={config[name]}" for name in config.deviations())
     figure.supxlabel(f"departs from the paper in: {named or 'nothing'}", fontsize=6, wrap=True)
     return figure

@@ -89,7 +89,7 @@ def results(seeds: Mapping[str, Sequence[Run]]) -> Table:
     rows = [
         [
             name,
-            f"MaxEnt-{run.config.method.upper()}, {run.config.env}, {run.config.preset}",
+            f"{run.config.title}, {run.config.env}, {run.config.preset}",
             str(run.seed),
             f"{len(run.metrics.get('iteration', ()))} of {run.config.budget.num_iterations}",
             *(number(last(run, metric), how) for metric, _, how in METRICS),

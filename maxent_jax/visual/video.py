@@ -26,7 +26,7 @@ def check() -> None:
         imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError):
         raise UsageError(
-            'videos need imageio-ffmpeg, which is not installed: pip install "maxent_jax[render]".'
+            "videos need imageio-ffmpeg, which is not installed: pip install imageio-ffmpeg."
         ) from None
 
 
