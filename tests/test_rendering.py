@@ -227,7 +227,7 @@ def test_a_video_that_cannot_be_written_leaves_nothing(tmp_path):
 
 def test_without_ffmpeg_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(errors.UsageError, match=r'pip install "maxent_jax\[render\]"'):
+    with pytest.raises(errors.UsageError, match="pip install imageio-ffmpeg"):
         video.check()
 
 
