@@ -84,7 +84,9 @@ MISTAKES = (
     train("--out {newer} --resume", "schema 99"),
     train("--preset smoke --seed 7 --out {run} --resume", "seed was 0 and is 7"),
     Mistake("experiments.train", "--wandb project", "pip install wandb", without="wandb"),
-    Mistake("experiments.train", "--tensorboard", "pip install tensorboardX", without="tensorboardX"),
+    Mistake(
+        "experiments.train", "--tensorboard", "pip install tensorboardX", without="tensorboardX"
+    ),
     Mistake("experiments.evaluate", "{missing}", "not the directory of a run"),
     Mistake("experiments.evaluate", "{run} --episodes 0", "at least 1"),
     Mistake("experiments.evaluate", "{newer}", "schema 99"),

@@ -223,7 +223,7 @@ class Config(_Checked):
 
     @property
     def own_bonus(self) -> str:
-        """ " with bonus NAME" if the bonus is set apart from the method, else nothing."""
+        """For titles: the bonus, if it is set apart from the method; else nothing."""
         bonus = self.intrinsic.bonus
         known = registry.METHODS.get(self.method)
         of_method = "none" if known is None else known.settings.get("bonus", "none")
