@@ -51,7 +51,7 @@ def leaves_equal(a, b):
 def test_iterate_is_traced_once_in_a_run_of_five_iterations(monkeypatch):
     calls = []
     traced = algorithm.iterate
-    monkeypatch.setattr(algorithm, "iterate", lambda c, s: calls.append(1) or traced(c, s))
+    monkeypatch.setattr(algorithm.loop, "iterate", lambda c, s: calls.append(1) or traced(c, s))
     config = tiny(num_iterations=5, mixture_episodes=6)
     run = jax.jit(algorithm.run, static_argnums=(0, 2))
     state, metrics = run(config.program(), algorithm.start(config), 5)

@@ -478,10 +478,8 @@ def test_the_weights_of_the_classic_environments_are_computed_once(tmp_path, mon
         np.testing.assert_array_equal(runs_of[0][:, 0], runs_of[1][:, 0])  # one policy, one weight
     curves = hazan_weights.curves(found)["pendulum"]
     beside = found["pendulum"]["weightings"]["η = 0.1"]["random_fresh_entropy"]
-    assert curves["fresh_entropy"][values.RANDOM].shape == (
-        1,
-        3,
-    )  # the seeds once, not per weighting
+    # The seeds once, not per weighting.
+    assert curves["fresh_entropy"][values.RANDOM].shape == (1, 3)
     np.testing.assert_allclose(curves["fresh_entropy"][values.RANDOM], beside, rtol=1e-6)
     table = hazan_weights.table(found)
     assert "probability_of_improvement" not in table["pendulum, fresh_entropy"]["uniform"]

@@ -193,11 +193,11 @@ def test_a_run_is_filmed(opengl, copy_of_smoke_run, capsys):
     lengths = maxent_jax.load_run(directory).rollout(1, 3).alive.sum(axis=1)
     for i, length in enumerate(lengths):
         # Ant steps 0.05 s; at 4 times the speed 4 steps make one of 20 frames a second.
-        frames, seconds = imageio_ffmpeg.count_frames_and_secs(videos / f"policy_{i}.mp4")
-        assert frames == -(-length // 4)
-        assert seconds == pytest.approx(frames / 20, abs=0.051)
-    frames, _ = imageio_ffmpeg.count_frames_and_secs(videos / "mixture.mp4")
-    assert frames == -(-lengths.max() // 4)
+        count, seconds = imageio_ffmpeg.count_frames_and_secs(videos / f"policy_{i}.mp4")
+        assert count == -(-length // 4)
+        assert seconds == pytest.approx(count / 20, abs=0.051)
+    count, _ = imageio_ffmpeg.count_frames_and_secs(videos / "mixture.mp4")
+    assert count == -(-lengths.max() // 4)
     half, gap = SIZE // 2, frames.GAP
     assert size_of(videos / "policy_1.png") == (3 * half + 2 * gap, half)
     assert size_of(videos / "mixture.png") == (3 * half + 2 * gap, 3 * half + 2 * gap)
