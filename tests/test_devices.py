@@ -33,8 +33,10 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from maxent_jax import algorithm, checkpoint, devices, runs, runtime
+from maxent_jax import algorithm
+from maxent_jax.algorithm import devices
 from maxent_jax.config import preset
+from maxent_jax.runs import checkpoint, files, runtime
 
 runtime.prepare(simulates_in_jax=False)
 env, num_seeds, directory = sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])
@@ -70,7 +72,7 @@ state = many.learner.replay.items.state
 part = state.addressable_shards[0].data.shape
 print("part of the replay", state.size // np.prod(part), "of", dict(mesh.shape))
 # No exchange has the replay's rows, all of them or a device's part.
-rows = {config.replay_size, config.replay_size // mesh.shape["envs"]}
+rows = {config.learner.replay_size, config.learner.replay_size // mesh.shape["envs"]}
 program = programs[1].train_segment.lower(many).compile().as_text()
 kinds = "all-gather|all-to-all|all-reduce|collective-permute"
 exchanges = [x for x in program.splitlines() if re.search(f" ({kinds})(-start)?[(]", x)]
@@ -85,7 +87,7 @@ calls = [x for x in program.splitlines() if 'custom_call_target="maxent_' in x]
 for line in calls if num_seeds > 1 else ():
     assert not re.search(rf"[[]{num_seeds},", line.split("custom-call")[0]), line
 
-runs.write_config(directory, config, {}, {})
+files.write_config(directory, config, {}, {})
 checkpoint.save(directory, many, checkpoint.Progress([], None, [], {}), {})
 compare(one, checkpoint.restore(directory, "0", config))
 compare(one, checkpoint.restore(directory, "0", config, placed))

@@ -159,7 +159,7 @@ def test_every_method_runs_on_both_backends(tmp_path, backend, method, period):
 def run_smoke(directory, env, backend, **changes):
     config = preset("smoke", env=env, backend=backend, num_iterations=1, **changes)
     with jax.numpy_rank_promotion("allow"), jax.legacy_prng_key("allow"):  # for brax
-        driver.train(config, directory, time.perf_counter())
+        train.run_to_end(config, directory, time.perf_counter(), driver.AS_USUAL)
     (row,) = files.read_metrics(directory)
     assert row["env_steps"] == 400 and row["num_invalid"] == 0
     assert maxent_jax.load_run(directory).histogram.sum() <= 400

@@ -101,7 +101,7 @@ def _train(directory: Path) -> None:
     arguments = train.read_arguments([*smoke.SMOKE, "--out", str(directory), "--resume"])
     options = driver.Options(save_minutes=arguments.save_minutes)
     with arguments.claim.hold(), contextlib.redirect_stdout(sys.stderr):
-        driver.train(arguments.config, directory, time.perf_counter(), options)
+        train.run_to_end(arguments.config, directory, time.perf_counter(), options)
 
 
 if __name__ == "__main__":
