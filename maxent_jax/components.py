@@ -39,7 +39,8 @@ def make(config: Config) -> Components:
 @functools.lru_cache(maxsize=8)
 def _make(config: Config) -> Components:
     with jax.ensure_compile_time_eval():  # the first call may come during a trace
-        registry.in_use.update((config.env, config.intrinsic.bonus))
+        made_of = {("environment", config.env), ("bonus", config.intrinsic.bonus)}
+        registry.in_use.update(made_of)
         entry = envs.entry(config.env)
         deviations: dict[str, Any] = {}
         if registry.environment(config.env).is_robot:

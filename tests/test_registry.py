@@ -109,6 +109,7 @@ def test_what_programs_were_made_of_cannot_be_replaced(restored_tables):
     components.make(preset("smoke", env="user:replaced"))
     with pytest.raises(ConfigError, match="'user:replaced' is already in use in this process"):
         envs.register("replaced", make)
+    registry.register_method("replaced", "last", 0, "mixture", "last")  # of another kind
 
 
 def test_a_run_is_trained_and_loaded_by_one_function(tmp_path):

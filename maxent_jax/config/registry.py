@@ -127,8 +127,8 @@ _REGISTERED_BY = {
     "method": "maxent_jax.config.register_method",
 }
 
-in_use: set[str] = set()
-"""Names of environments and bonuses that programs of this process were made of."""
+in_use: set[tuple[str, str]] = set()
+"""Kind and name of each environment and bonus that programs of this process were made of."""
 imported: list[str] = []
 """The modules that `import_modules` imported, as the user named them."""
 
@@ -169,6 +169,12 @@ def bonus(name: str) -> BonusRow:
     return _row("bonus", name, BONUSES)
 
 
+def bonus_of(method_name: str) -> str | None:
+    """Returns the bonus that a method sets; None if it sets none, or is not registered."""
+    row = METHODS.get(method_name)
+    return None if row is None else row.settings.get("bonus")
+
+
 def check_name(kind: str, name: Any) -> None:
     """Raises ConfigError unless something can be registered under the name.
 
@@ -176,16 +182,16 @@ def check_name(kind: str, name: Any) -> None:
     """
     if not isinstance(name, str) or not name:
         raise ConfigTypeError(f"the {kind}'s name is {name!r}, but must be a non-empty string.")
-    if f"{USER}{name}" in in_use:
+    if (kind, f"{USER}{name}") in in_use:
         raise ConfigError(
             f"{kind} '{USER}{name}' is already in use in this process: choose another name, or "
             f"restart Python."
         )
 
 
-def register_environment(name: str, row: EnvironmentRow) -> None:
-    """Adds an environment of a user; see envs.register, which makes the row."""
-    ENVIRONMENTS[f"{USER}{name}"] = row
+def register_environment(name: str, entry: Any) -> None:
+    """Adds an environment of a user; see envs.register, which makes the envs.Entry."""
+    ENVIRONMENTS[f"{USER}{name}"] = _USERS._replace(entry=entry)
 
 
 def register_bonus(name: str, row: BonusRow) -> None:

@@ -225,8 +225,7 @@ class Config(_Checked):
     def own_bonus(self) -> str:
         """For titles: the bonus, if it is set apart from the method; else nothing."""
         bonus = self.intrinsic.bonus
-        known = registry.METHODS.get(self.method)
-        of_method = "none" if known is None else known.settings.get("bonus", "none")
+        of_method = registry.bonus_of(self.method) or "none"
         return "" if bonus == of_method else f" with bonus {bonus}"
 
     @property

@@ -123,7 +123,7 @@ def _check_together(c: SimpleNamespace, row: EnvironmentRow) -> None:
     policies = 1 + c.num_iterations * c.snapshots
     for wrong, sentence in (
         (
-            c.bonus != _bonus_of(c.method, c.bonus),
+            registry.bonus_of(c.method) not in (None, c.bonus),
             f"method is {c.method}, but bonus is {c.bonus}: leave bonus out, the method sets it.",
         ),
         (
@@ -248,12 +248,6 @@ def _check_together(c: SimpleNamespace, row: EnvironmentRow) -> None:
     ):
         if wrong:
             raise ConfigError(sentence)
-
-
-def _bonus_of(method: str, otherwise: str) -> str:
-    """The bonus that the method sets, if it sets any."""
-    known = registry.METHODS.get(method)
-    return otherwise if known is None else known.settings.get("bonus", otherwise)
 
 
 def _neighbors_of(bonus: str) -> int:

@@ -22,7 +22,7 @@ from brax.envs.base import Env
 
 from maxent_jax.checks import check_number, check_path, check_whole
 from maxent_jax.config import registry
-from maxent_jax.config.registry import MUJOCO_ENVS, EnvironmentRow, resolve
+from maxent_jax.config.registry import MUJOCO_ENVS, resolve
 from maxent_jax.config.validation import check_physics
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs.entries import Entry
@@ -107,10 +107,7 @@ def register(
     ):
         if wrong:
             raise ConfigTypeError(sentence)
-    row = EnvironmentRow(
-        Entry(make, grid, None, phi), backends=registry.BACKENDS, physics=registry.PHYSICS
-    )
-    registry.register_environment(name, row)
+    registry.register_environment(name, Entry(make, grid, None, phi))
 
 
 def from_xml(
