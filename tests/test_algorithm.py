@@ -259,6 +259,68 @@ def test_the_refresh_period_counts_steps_of_all_envs(period, refreshes):
     assert changes == refreshes
 
 
+@functools.lru_cache
+def lagged(**changes):
+    """A config with a policy lag, its jitted vector steps, and a state with a filled replay."""
+    config = tiny(policy_lag=1, normalize_inputs=True, **changes)
+    state, _ = call("begin", config, algorithm.start(config))
+    steps = jax.jit(functools.partial(training.steps, components.make(config.program())))
+    learner, metrics = steps(state.method, state.learner, jax.random.split(jax.random.key(7), 5))
+    return config, steps, state, learner, metrics
+
+
+def test_with_a_lag_the_first_vector_step_has_nothing_to_learn_from():
+    config, steps, state, _, _ = lagged()
+    learner, metrics = steps(state.method, state.learner, jax.random.split(jax.random.key(0), 1))
+    kept, before = learner.agent.parameters, state.learner.agent.parameters
+    assert leaves_equal(kept._replace(moments=None), before._replace(moments=None))
+    assert not leaves_equal(kept.moments, before.moments)  # which saw the states
+    assert int(learner.gradient_steps) == 0 and metrics["critic_loss"] == 0
+    assert int(learner.replay.size) == int(learner.env_steps) == config.budget.num_envs
+
+
+def test_with_a_lag_every_later_vector_step_learns():
+    config, _, _, learner, metrics = lagged()
+    assert int(learner.gradient_steps) == 4 * config.updates_per_vector_step
+    assert (metrics["critic_loss"][1:] > 0).all()
+
+
+def test_with_a_lag_gradient_steps_do_not_see_the_vector_step_beside_them():
+    _, steps, state, learner, _ = lagged()
+    keys = jax.random.split(jax.random.key(1), 1)
+    elsewhere = learner._replace(
+        episodes=learner.episodes._replace(
+            env=jax.tree.map(lambda x: jnp.roll(x, 1, axis=0), learner.episodes.env)
+        )
+    )
+    one, other = (steps(state.method, x, keys)[0] for x in (learner, elsewhere))
+    without_moments = lambda x: x.agent.parameters._replace(moments=None)
+    assert not leaves_equal(one.replay.items.state, other.replay.items.state)
+    assert leaves_equal(without_moments(one), without_moments(other))
+    # and without a lag they do: the test can fail
+    step = compiled_step(tiny(normalize_inputs=True).program())
+    one, other = (step(state.method, x, keys[0])[0] for x in (learner, elsewhere))
+    assert not leaves_equal(without_moments(one), without_moments(other))
+
+
+def test_with_a_lag_vector_steps_do_not_depend_on_how_they_are_divided():
+    _, steps, state, learner, _ = lagged()
+    keys = jax.random.split(jax.random.key(2), 6)
+    whole, _ = steps(state.method, learner, keys)
+    for part in (keys[:2], keys[2:4], keys[4:]):
+        learner, _ = steps(state.method, learner, part)
+    assert leaves_equal(whole, learner)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["la", "ngu", "rnd"])  # those that change more than the agent
+def test_with_a_lag_other_methods_learn_too(method):
+    config, _, state, learner, metrics = lagged(method=method, batch_size=32, shaping=0.0)
+    assert int(learner.gradient_steps) == 4 * config.updates_per_vector_step
+    assert all(np.isfinite(x).all() for x in metrics.values())
+    assert not leaves_equal(learner.agent.parameters.actor, state.learner.agent.parameters.actor)
+
+
 def test_the_history_holds_what_was_visited():
     config, _, _, _, trained = stages("la")
     p = components.make(config)

@@ -54,11 +54,12 @@ class StopAt(Interruption):
         dict(method="h"),
         dict(method="la", refresh_period=10),
         dict(normalize_inputs=True, actor_average=0.01, snapshots=2),
+        dict(env="ant", normalize_inputs=True, policy_lag=1),
     ],
-    ids=["h", "la", "v"],
+    ids=["h", "la", "v", "lag"],
 )
 def test_a_run_stopped_anywhere_ends_as_one_that_was_not(tmp_path, monkeypatch, changes):
-    config = preset("smoke", env="pendulum", num_seeds=2, **changes)
+    config = preset("smoke", **{"env": "pendulum", "num_seeds": 2, **changes})
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     for directory in (whole, broken):
         directory.mkdir()

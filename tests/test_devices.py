@@ -39,11 +39,11 @@ from maxent_jax.config import preset
 from maxent_jax.runs import checkpoint, files, runtime
 
 runtime.prepare(simulates_in_jax=False)
-env, num_seeds, directory = sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])
+env, num_seeds, lag, directory = sys.argv[1], *map(int, sys.argv[2:4]), Path(sys.argv[4])
 config = preset(
     "smoke", env=env, num_seeds=num_seeds, num_envs=16, steps_per_iteration=80,
     updates_per_step=1 / 16, num_segments=1, episode_length=10, num_iterations=1,
-    reference_size=64, shaping=1.0,
+    reference_size=64, shaping=1.0, policy_lag=lag,
 )
 mesh = devices.make_mesh(config, jax.devices())
 placed = devices.placement(config, mesh)
@@ -97,13 +97,17 @@ print("equal")
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("env", "num_seeds", "across"),
-    [("ant", 1, {"seeds": 1, "envs": 8}), ("pendulum", 4, {"seeds": 4, "envs": 2})],
+    ("env", "num_seeds", "lag", "across"),
+    [
+        ("ant", 1, 0, {"seeds": 1, "envs": 8}),
+        ("ant", 1, 1, {"seeds": 1, "envs": 8}),
+        ("pendulum", 4, 0, {"seeds": 4, "envs": 2}),
+    ],
 )
-def test_eight_devices_do_what_one_does(tmp_path, env, num_seeds, across):
+def test_eight_devices_do_what_one_does(tmp_path, env, num_seeds, lag, across):
     flags = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=8"
     done = subprocess.run(
-        [sys.executable, "-c", ON_EIGHT_DEVICES, env, str(num_seeds), str(tmp_path)],
+        [sys.executable, "-c", ON_EIGHT_DEVICES, env, str(num_seeds), str(lag), str(tmp_path)],
         env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
         capture_output=True,
         text=True,

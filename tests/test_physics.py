@@ -47,6 +47,11 @@ def step(path, model):
     return jax.jit(make_step(path, model))
 
 
+HALVES = {"python": mujoco_backend.halves_through_python}
+if native.library():
+    HALVES["xla"] = mujoco_backend.halves_through_xla
+
+
 def random_run(task, model):
     """States and controls [B, ...] of a random policy, warm starts included."""
     key_start, key_control = jax.random.split(jax.random.key(0))
@@ -408,3 +413,56 @@ def test_a_log_that_the_user_chose_stays(log, tmp_path):
     mujoco.MjLogConfig.set(log)
     diverge(physics.load_model(physics.gymnasium_xml("ant.xml")))
     assert (tmp_path / "mine.txt").exists()
+
+
+def noise(key):
+    """Work beside a step: numbers that depend on the key alone."""
+    drawn = jax.random.normal(key, (300, 300))
+    return drawn @ drawn, drawn.sum()
+
+
+@pytest.mark.parametrize("of", HALVES)
+def test_a_step_beside_a_computation_is_that_step(of, model, visited):
+    beside = mujoco_backend.beside(HALVES[of](model, FRAME_SKIP, ()))
+    key = jax.random.key(3)
+    (found, _), drawn = jax.jit(lambda s, c, k: beside(s, c, noise, k))(*visited, key)
+    assert_same_bits(found, make_step(of, model)(*visited))
+    assert_same_bits(drawn, jax.jit(noise)(key)[0])
+
+
+@pytest.mark.parametrize("of", HALVES)
+def test_steps_of_several_seeds_beside_a_computation_are_those_steps(of, model, visited):
+    beside = mujoco_backend.beside(HALVES[of](model, FRAME_SKIP, ()))
+    states, controls = jax.tree.map(lambda x: x[:40].reshape(4, 10, -1), visited)
+    keys = jax.random.split(jax.random.key(0), 4)
+
+    def run(state, controls, key):
+        def body(state, control):
+            (state, _), drawn = beside(state, control, noise, key)
+            return state, drawn.sum()
+
+        return jax.lax.scan(body, state, jnp.stack([controls] * 5))
+
+    found, drawn = jax.jit(jax.vmap(run))(states, controls, keys)
+    expected, step = states, make_step(of, model)
+    for _ in range(5):
+        expected = step(expected, controls)
+    assert_same_bits(found, expected)
+    for i in range(4):
+        np.testing.assert_allclose(drawn[i, 0], jax.jit(noise)(keys[i])[0].sum(), rtol=1e-5)
+
+
+def test_an_environment_steps_beside_a_computation_as_alone():
+    env = envs.make("humanoid", backend="mujoco")  # which has derived fields
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 5))
+    action = jax.random.uniform(jax.random.key(1), (5, env.action_size), minval=-1, maxval=1)
+    beside = jax.jit(lambda s, a, k: env.step_beside(s, a, noise, k))
+    after, _ = beside(state, action, jax.random.key(2))
+    assert_same_bits(after, jax.jit(jax.vmap(env.step))(state, action))
+
+
+@pytest.mark.skipif(native.library() is None, reason="needs the native library")
+def test_a_step_that_was_not_started_cannot_be_finished(model, visited):
+    finish = mujoco_backend.halves_through_xla(model, FRAME_SKIP, ()).finish
+    with pytest.raises(jax.errors.JaxRuntimeError, match="was not started"):
+        jax.block_until_ready(finish(jnp.int32(-1), jnp.float32(0), *visited))

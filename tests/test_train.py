@@ -292,7 +292,10 @@ def test_evaluate_says_when_there_is_no_checkpoint(tmp_path):
     assert "no complete checkpoint" in call("evaluate", tmp_path, expect=2).stderr
 
 
-TOY = ("knn", "envs", "physics", "sac", "seeds", "forward_velocity", "compile_time", "replay")
+TOY = (
+    *("knn", "envs", "physics", "sac", "seeds", "forward_velocity", "compile_time", "replay"),
+    "growth",
+)
 
 
 @pytest.mark.slow

@@ -141,12 +141,9 @@ def train_segment(config: Config, state: State) -> tuple[State, Metrics]:
     """
     p = components.make(config)
 
-    def step(learner, key):
-        return training.step(p, state.method, learner, key)
-
     key, key_steps = jax.random.split(state.key)
     keys = jax.random.split(key_steps, config.vector_steps)
-    learner, metrics = jax.lax.scan(step, state.learner, keys)
+    learner, metrics = training.steps(p, state.method, state.learner, keys)
     archive = state.archive
     if config.mixture.snapshots > 1:
         archive = mixture.append(archive, agent.archived(learner.agent), _due(config, learner))

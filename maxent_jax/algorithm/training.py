@@ -1,5 +1,6 @@
 """One vector step with its gradient steps, under the current reward."""
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -49,6 +50,13 @@ class Learner(NamedTuple):
     gradient_steps: jax.Array  # [] int32
 
 
+class Learned(NamedTuple):
+    """What gradient steps change."""
+
+    agent: Agent
+    bonus: Any
+
+
 def init(components: Components, key: jax.Array) -> Learner:
     """Returns a new learner with new episodes, an empty replay and an empty reference."""
     config, sac = components.config, components.sac
@@ -79,36 +87,150 @@ def init(components: Components, key: jax.Array) -> Learner:
     )
 
 
+class _Keys(NamedTuple):
+    """The keys of one vector step."""
+
+    act: jax.Array
+    random: jax.Array
+    env: jax.Array
+    history: jax.Array
+    yaw: jax.Array
+    learn: jax.Array
+
+
+def _keys(key: jax.Array) -> _Keys:
+    return _Keys(*jax.random.split(key, 6))
+
+
+def steps(
+    components: Components, method: Method, learner: Learner, keys: jax.Array
+) -> tuple[Learner, Metrics]:
+    """Takes a vector step with its gradient steps for each key.
+
+    With a policy lag, the gradient steps of a vector step learn from what the replay held before
+    it, and run beside the simulation.
+
+    Args:
+      components: the static part.
+      method: the method.
+      learner: the learner.
+      keys: [T].
+    Returns:
+      The learner, and metrics [T]; those named num_ are counts.
+    """
+    if not components.config.learner.policy_lag:
+        return jax.lax.scan(functools.partial(step, components, method), learner, keys)
+
+    # Batches are drawn right after the vector step before. Drawn later, they would make XLA copy
+    # the replay, which the vector step changes in place.
+    def draw(learner, key):
+        return learner.replay.size > 0, _draw(components, learner, _keys(key).learn)
+
+    def step_and_draw(carry, keys):
+        learner, drawn = carry
+        key, next_key = keys
+        ready, batches = drawn
+        learner, metrics = _step_beside(components, method, learner, ready, batches, key)
+        return (learner, draw(learner, next_key)), metrics
+
+    first = learner, draw(learner, keys[0])
+    (learner, _), metrics = jax.lax.scan(step_and_draw, first, (keys, jnp.roll(keys, -1)))
+    return learner, metrics
+
+
 def step(
     components: Components, method: Method, learner: Learner, key: jax.Array
 ) -> tuple[Learner, Metrics]:
     """Steps all envs once, then takes the gradient steps; metrics named num_ are counts."""
-    config = components.config
-    key_act, key_random, key_env, key_history, key_yaw, key_learn = jax.random.split(key, 6)
-
-    policy = learner.agent.parameters.policy
-    observation = learner.episodes.env.obs[: config.budget.num_envs]
-    action = sac_agent.act(components.sac, policy, observation, key_act)
-    if config.evaluation.random_baseline:
-        random = jax.random.uniform(key_random, action.shape, minval=-1.0, maxval=1.0)
-        action = jnp.concatenate([action, random])
-    age = learner.episodes.age[: config.budget.num_envs]
+    keys, length = _keys(key), components.config.environment.episode_length
     episodes, everyone = base.step(
-        components.env, learner.episodes, action, config.environment.episode_length, key_env
+        components.env, learner.episodes, _action(components, learner, keys), length, keys.env
     )
+    learner, of_steps = _record(components, method, learner, episodes, everyone, keys)
+    drawn = _draw(components, learner, keys.learn)
+    learned, of_updates = _learn(components, method, learner, drawn, keys.learn)
+    return _updated(components, learner, learned), of_updates | of_steps
+
+
+def _step_beside(
+    components: Components,
+    method: Method,
+    learner: Learner,
+    ready: jax.Array,
+    drawn: Experience,
+    key: jax.Array,
+) -> tuple[Learner, Metrics]:
+    """Steps all envs once; beside it, takes the gradient steps, if the draw holds anything."""
+    keys, length = _keys(key), components.config.environment.episode_length
+
+    def work(key):
+        learn = functools.partial(_learn, components, method, learner, drawn)
+        skip = lambda key: _unlearned(learner, *jax.eval_shape(learn, key))
+        learned, metrics = jax.lax.cond(ready, learn, skip, key)
+        return (learned, metrics), learned.agent.parameters.log_temperature
+
+    action = _action(components, learner, keys)
+    episodes, everyone, (learned, of_updates) = base.step_beside(
+        components.env, learner.episodes, action, length, keys.env, work, keys.learn
+    )
+    learner = _updated(components, learner, learned, ready)
+    learner, of_steps = _record(components, method, learner, episodes, everyone, keys)
+    return learner, of_updates | of_steps
+
+
+def _unlearned(learner: Learner, _: Learned, metrics: Metrics) -> tuple[Learned, Metrics]:
+    """The result of no gradient steps: zeros for metrics."""
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metrics)
+    return Learned(learner.agent, learner.bonus), zeros
+
+
+def _updated(
+    components: Components, learner: Learner, learned: Learned, ready: jax.Array | bool = True
+) -> Learner:
+    taken = components.config.updates_per_vector_step * jnp.asarray(ready, jnp.int32)
+    return learner._replace(
+        agent=learned.agent, bonus=learned.bonus, gradient_steps=learner.gradient_steps + taken
+    )
+
+
+def _action(components: Components, learner: Learner, keys: _Keys) -> jax.Array:
+    """The actions of the agent in its environments, and of the random baseline in its own."""
+    config = components.config
+    observation = learner.episodes.env.obs[: config.budget.num_envs]
+    policy = learner.agent.parameters.policy
+    action = sac_agent.act(components.sac, policy, observation, keys.act)
+    if config.evaluation.random_baseline:
+        random = jax.random.uniform(keys.random, action.shape, minval=-1.0, maxval=1.0)
+        action = jnp.concatenate([action, random])
+    return action
+
+
+def _record(
+    components: Components,
+    method: Method,
+    learner: Learner,
+    episodes: Episodes,
+    everyone: Transition,
+    keys: _Keys,
+) -> tuple[Learner, Metrics]:
+    """Adds the transitions of a vector step to all that remembers them."""
+    config = components.config
+    age = learner.episodes.age[: config.budget.num_envs]
     transition = jax.tree.map(lambda x: x[: config.budget.num_envs], everyone)
     others = jax.tree.map(lambda x: x[config.budget.num_envs :], everyone)
 
     features = components.phi(transition.next_observation)
-    history = reservoir.add(learner.history, features, transition.valid, key_history)
+    history = reservoir.add(learner.history, features, transition.valid, keys.history)
     reference = _refreshed(components, method, learner, history)
     bonus, memory, novelty = _episodic(components, learner, transition, features, age)
     ring, rows = experience.add(
-        components, reference, learner.replay, transition, learner.place, novelty, key_yaw
+        components, reference, learner.replay, transition, learner.place, novelty, keys.yaw
     )
     ended = transition.terminated | transition.truncated
     learner = learner._replace(
-        agent=sac_agent.see(components.sac, learner.agent, observation, transition.valid),
+        agent=sac_agent.see(
+            components.sac, learner.agent, transition.observation, transition.valid
+        ),
         replay=ring,
         place=jnp.where(ended, -1 - episodes.start[: config.budget.num_envs], rows),
         episodes=episodes,
@@ -121,9 +243,8 @@ def step(
             components, learner.random_visits, others.next_observation, others.valid
         ),
         env_steps=learner.env_steps + config.budget.num_envs,
-        gradient_steps=learner.gradient_steps + config.updates_per_vector_step,
     )
-    learner, metrics = _learn(components, method, learner, key_learn)
+    metrics: Metrics = {}
     if components.torso is not None:
         flipped = components.torso.flipped(transition.next_observation)
         metrics["flipped_share"] = jnp.mean(flipped.astype(jnp.float32))
@@ -236,16 +357,21 @@ def visit(components: Components, visits: Visits, states: jax.Array, counts: jax
     return Visits(visits.cells + cells, visits.off_grid + jnp.sum(number) - jnp.sum(cells))
 
 
-def _learn(
-    components: Components, method: Method, learner: Learner, key: jax.Array
-) -> tuple[Learner, Metrics]:
-    """The gradient steps of one vector step, on rewards of the current reference."""
+def _draw(components: Components, learner: Learner, key: jax.Array) -> Experience:
+    """Draws the batches of one vector step, [updates, B]."""
     config = components.config
+    key_sample, _ = jax.random.split(key)
     shape = (config.updates_per_vector_step, config.learner.batch_size)
-    key_sample, key_update = jax.random.split(key)
-    drawn = experience.sample(
-        components, learner.replay, learner.episodes.starts.obs, shape, key_sample
-    )
+    starts = learner.episodes.starts.obs
+    return experience.sample(components, learner.replay, starts, shape, key_sample)
+
+
+def _learn(
+    components: Components, method: Method, learner: Learner, drawn: Experience, key: jax.Array
+) -> tuple[Learned, Metrics]:
+    """The gradient steps of one vector step, on rewards of the learner's reference."""
+    config = components.config
+    _, key_update = jax.random.split(key)
     # Stored distances stay valid while the reference does; the branch touches only drawn rows.
     distances = jax.lax.cond(
         _changes_within_iteration(method) & (not config.intrinsic.stale_rewards),
@@ -266,7 +392,7 @@ def _learn(
     def update(agent, batch_and_key):
         return sac_agent.update(components.sac, agent, *batch_and_key)
 
-    keys = jax.random.split(key_update, shape[0])
+    keys = jax.random.split(key_update, config.updates_per_vector_step)
     agent, metrics = jax.lax.scan(update, learner.agent, (batches, keys))
     metrics = jax.tree.map(jnp.mean, metrics | of_bonus)
     metrics |= {
@@ -274,7 +400,7 @@ def _learn(
         "replay_paid": jnp.mean(paid[..., 0]),
         "replay_bonus": jnp.mean(outcomes.bonus[..., 0]),
     }
-    return learner._replace(agent=agent, bonus=bonus), metrics
+    return Learned(agent, bonus), metrics
 
 
 def _paid_by_bonus(

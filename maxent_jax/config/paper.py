@@ -41,6 +41,7 @@ _PAPER: dict[str, tuple[Any, str]] = {
     "target_entropy_scale": (1.0, "the target entropy is not minus the number of action dims"),
     "lagrangian_entropy": (False, "the soft return counts entropy relative to its target"),
     "normalize_inputs": (False, "network inputs have mean 0 and standard deviation 1"),
+    "policy_lag": (0, "gradient steps do not see the newest steps of the environments"),
     "actor_average": (0.0, "a moving average of the actor is archived"),
     "restart_temperature": (False, "the temperature is reset at each iteration"),
 }

@@ -33,6 +33,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         updates_per_step=0.25,
         hidden_size=128,
         **_FAST_LEARNER,
+        policy_lag=1,
         replay_size=240_000,
     ),
     "gpu": dict(

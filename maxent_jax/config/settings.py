@@ -160,6 +160,9 @@ class Learner(_Checked):
     """Count entropy relative to its target, so that survival is neutral at the target entropy."""
     restart_temperature: bool = False
     """Reset α to its initial value at the start of each iteration."""
+    policy_lag: int = 0
+    """Vector steps by which gradient steps lag behind the environments: 0, or 1, so that
+    C MuJoCo and the gradient steps run at the same time."""
     actor_average: float = 0.0
     """Rate per update of the actor's moving average, which is archived; 0: archive the actor."""
 

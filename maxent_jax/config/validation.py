@@ -37,7 +37,7 @@ _AT_MOST_ONE = ("torque_limit", "discount", "soft_update_rate", "eta", "actor_av
 _NOT_NEGATIVE = (
     *("seed", "plateau_segments", "plateau_tolerance", "shaping", "episodic_weight"),
     *("alive_bonus", "actor_average"),
-    *("yaw_copies", "discount", "target_entropy_scale"),
+    *("yaw_copies", "discount", "target_entropy_scale", "policy_lag"),
 )
 
 
@@ -217,6 +217,7 @@ def _check_together(c: SimpleNamespace, row: EnvironmentRow) -> None:
             f"batch-size is {c.batch_size}, but bonus {c.bonus} needs more than "
             f"{_neighbors_of(c.bonus)} transitions in the {updates:g} batches of a vector step.",
         ),
+        (c.policy_lag > 1, f"policy-lag is {c.policy_lag}, but must be 0 or 1."),
         (
             4 * c.num_envs > c.replay_size,
             f"replay-size is {c.replay_size}, but must be at least 4 × num-envs = "

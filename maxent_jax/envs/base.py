@@ -4,16 +4,28 @@ Adds what a single Env lacks: a time limit separate from termination, a random s
 episode, the true last state of each episode, and a guard against physics that is not finite.
 """
 
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State
 
+from maxent_jax.envs.physics import Work
+from maxent_jax.envs.task import MujocoEnv
 from maxent_jax.types import Transition
 
 Tree = TypeVar("Tree")
-__all__ = ["Env", "Episodes", "State", "draw_starts", "finite_rows", "init", "select_rows", "step"]
+__all__ = [
+    "Env",
+    "Episodes",
+    "State",
+    "draw_starts",
+    "finite_rows",
+    "init",
+    "select_rows",
+    "step",
+    "step_beside",
+]
 
 
 class Episodes(NamedTuple):
@@ -57,8 +69,38 @@ def step(
     Returns:
       The episodes after the step, and the transitions [N, ...].
     """
+    return _goes_on(episodes, jax.vmap(env.step)(episodes.env, action), action, episode_length, key)
+
+
+def step_beside(
+    env: Env,
+    episodes: Episodes,
+    action: jax.Array,
+    episode_length: int,
+    key: jax.Array,
+    work: Work,
+    key_work: jax.Array,
+) -> tuple[Episodes, Transition, Any]:
+    """Takes the step of `step` while something else is computed, where the environment allows it.
+
+    Args: as `step`, and
+      work: what else to compute, see `envs.physics.Work`.
+      key_work: the key that it is called with.
+    Returns:
+      The episodes after the step, the transitions [N, ...], and the result of `work`.
+    """
+    if isinstance(env, MujocoEnv):
+        after, result = env.step_beside(episodes.env, action, work, key_work)
+    else:
+        after, (result, _) = jax.vmap(env.step)(episodes.env, action), work(key_work)
+    return *_goes_on(episodes, after, action, episode_length, key), result
+
+
+def _goes_on(
+    episodes: Episodes, after: State, action: jax.Array, episode_length: int, key: jax.Array
+) -> tuple[Episodes, Transition]:
+    """The episodes after a step to `after` [N, ...], and the transitions [N, ...]."""
     before = episodes.env
-    after = jax.vmap(env.step)(before, action)
     valid = finite_rows(after)
     age = episodes.age + 1
     terminated = ~valid | (after.done > 0)

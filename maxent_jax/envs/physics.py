@@ -8,7 +8,7 @@ same options, behind the same interface.
 import importlib.util
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import mujoco
@@ -28,6 +28,18 @@ Derived = dict[str, jax.Array]
 """Fields of MjData that a task observes in addition to the state, each [..., its size]."""
 
 
+Work = Callable[[jax.Array], tuple[Any, jax.Array]]
+"""A computation that runs beside a step: from a typed key to its result, and to a number [] that it
+computes last."""
+
+
+StepBeside = Callable[
+    [PhysicsState, jax.Array, Work, jax.Array], tuple[tuple[PhysicsState, Derived], Any]
+]
+"""`step_beside(state, control, work, key)` returns what `step(state, control)` returns, and the
+result of `work(key)`, which runs at the same time."""
+
+
 class Physics(NamedTuple):
     """A model on a backend."""
 
@@ -36,6 +48,8 @@ class Physics(NamedTuple):
     after mj_step and mj_rnePostConstraint: they belong to the last evaluation of the dynamics."""
     derive: Callable[[PhysicsState], Derived]
     """The derived fields of a start, before any control or external force acts."""
+    step_beside: StepBeside | None = None
+    """None: the backend cannot step beside another computation."""
 
 
 class Options(NamedTuple):

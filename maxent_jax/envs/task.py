@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from maxent_jax.checks import check_choice, check_number
 from maxent_jax.config.registry import BACKENDS, PHYSICS
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import mjx_backend, mujoco_backend, physics
-from maxent_jax.envs.physics import Derived, Options, PhysicsState
+from maxent_jax.envs.physics import Derived, Options, PhysicsState, Work
 from maxent_jax.envs.torso import Torso
 from maxent_jax.errors import ConfigError
 from maxent_jax.precision import in_32_bits
@@ -103,9 +103,39 @@ class MujocoEnv(Env):
         Raises:
           ValueError: the action has the wrong size.
         """
+        control = self._control(action)
+        return self._reached(state, *self._physics.step(state.pipeline_state, control))
+
+    @in_32_bits
+    def step_beside(
+        self, state: State, action: jax.Array, work: Work, key: jax.Array
+    ) -> tuple[State, Any]:
+        """Takes one control step of N episodes while something else is computed.
+
+        C MuJoCo steps on the cores that `work` leaves idle. Other simulators step afterwards.
+
+        Args:
+          state: [N, ...].
+          action: [N, A] in [-1, 1].
+          work: called with the key, once.
+          key: typed.
+        Returns:
+          The states [N, ...] that `jax.vmap(self.step)` returns, and the result of `work`.
+        Raises:
+          ValueError: the action has the wrong size.
+        """
+        if self._physics.step_beside is None:
+            result, _ = work(key)
+            return jax.vmap(self.step)(state, action), result
+        control = jax.vmap(self._control)(action)
+        reached, result = self._physics.step_beside(state.pipeline_state, control, work, key)
+        return jax.vmap(self._reached)(state, *reached), result
+
+    def _control(self, action: jax.Array) -> jax.Array:
         action = check_action(self, action)
-        control = self._control_center + self._control_span * jnp.clip(action, -1, 1)
-        after, derived = self._physics.step(state.pipeline_state, control)
+        return self._control_center + self._control_span * jnp.clip(action, -1, 1)
+
+    def _reached(self, state: State, after: PhysicsState, derived: Derived) -> State:
         observation = self.task.observe(after, derived)
         healthy = jnp.array(True)
         if self._end_unhealthy:

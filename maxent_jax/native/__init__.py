@@ -15,7 +15,7 @@ import jax
 
 from maxent_jax.errors import ConfigError
 
-TARGETS = ("maxent_knn", "maxent_physics")
+TARGETS = ("maxent_knn", "maxent_physics", "maxent_physics_start", "maxent_physics_finish")
 CUDA_TARGET = "maxent_knn_cuda"
 # Builds, fastest first, and the processors that run each, by their number from maxent_level.
 LEVELS = {"v4": (4,), "v3": (3, 4), "v8": (8,)}

@@ -6,6 +6,7 @@
 #include <cstdint>
 #include <iterator>
 #include <map>
+#include <memory>
 #include <mutex>
 #include <string>
 #include <string_view>
@@ -18,9 +19,13 @@
 namespace {
 
 namespace ffi = xla::ffi;
+using maxent::Jobs;
 using maxent::num_threads;
+using maxent::offer;
 using maxent::parallel;
 using Floats = ffi::Buffer<ffi::F32>;
+using Words = ffi::Buffer<ffi::U32>;
+using Tickets = ffi::Buffer<ffi::S32>;
 
 // Functions of the MuJoCo that Python has loaded: this library is not linked against MuJoCo.
 struct Functions {
@@ -120,30 +125,123 @@ Simulators& simulators() {
   return made;
 }
 
+Simulator* find(std::string_view model) {
+  const std::lock_guard<std::mutex> lock(simulators().mutex);
+  const auto found = simulators().by_name.find(model);
+  return found == simulators().by_name.end() ? nullptr : &found->second;
+}
+
+ffi::Error not_loaded() {
+  return ffi::Error(ffi::ErrorCode::kNotFound, "the model of a program is not loaded");
+}
+
+int64_t num_rows(const Floats& x) {
+  const auto shape = x.dimensions();
+  return x.element_count() / shape[shape.size() - 1];
+}
+
+// Several jobs for each thread, since robots that lie on the ground take longer.
+int64_t rows_of_job(ffi::ThreadPool& pool, int64_t count) {
+  return std::max<int64_t>(1, count / (8 * num_threads(pool)));
+}
+
 ffi::Error step(ffi::ThreadPool pool, Floats qpos, Floats qvel, Floats warmstart, Floats control,
                 std::string_view model, int64_t num_substeps, ffi::Result<Floats> next_qpos,
                 ffi::Result<Floats> next_qvel, ffi::Result<Floats> next_warmstart,
                 ffi::Result<Floats> derived) {
-  Simulator* simulator = nullptr;
-  {
-    const std::lock_guard<std::mutex> lock(simulators().mutex);
-    const auto found = simulators().by_name.find(model);
-    if (found == simulators().by_name.end())
-      return ffi::Error(ffi::ErrorCode::kNotFound, "the model of a program is not loaded");
-    simulator = &found->second;
-  }
+  Simulator* simulator = find(model);
+  if (simulator == nullptr) return not_loaded();
   const Simulator::Rows rows{
       qpos.typed_data(),       qvel.typed_data(),       warmstart.typed_data(),
       control.typed_data(),    next_qpos->typed_data(), next_qvel->typed_data(),
       next_warmstart->typed_data(), derived->typed_data(),
   };
-  const auto shape = qpos.dimensions();
-  const int64_t count = qpos.element_count() / shape[shape.size() - 1];
-  // Several jobs for each thread, since robots that lie on the ground take longer.
-  const int64_t share = std::max<int64_t>(1, count / (8 * num_threads(pool)));
+  const int64_t count = num_rows(qpos), share = rows_of_job(pool, count);
   parallel(pool, (count + share - 1) / share, [&](int64_t job) {
     simulator->run(rows, job * share, std::min(count, (job + 1) * share), num_substeps);
   });
+  return ffi::Error::Success();
+}
+
+// A step that XLA's idle threads take while the program goes on. Between `start` and `finish` its
+// data lies here, since XLA would use the memory for something else.
+struct Started {
+  std::vector<float> inputs, outputs;
+  std::shared_ptr<Jobs> jobs;
+};
+
+struct StartedSteps {
+  std::mutex mutex;
+  int32_t last = 0;
+  std::map<int32_t, std::shared_ptr<Started>> by_ticket;
+};
+
+StartedSteps& started_steps() {
+  static auto& made = *new StartedSteps;
+  return made;
+}
+
+// Starts a step and returns a ticket for it. `key` is returned unchanged: what is computed from the
+// result runs after the start, whatever order XLA would prefer.
+ffi::Error start(ffi::ThreadPool pool, Floats qpos, Floats qvel, Floats warmstart, Floats control,
+                 Words key, std::string_view model, int64_t num_substeps, int64_t derived_size,
+                 ffi::Result<Tickets> ticket, ffi::Result<Words> same_key) {
+  Simulator* simulator = find(model);
+  if (simulator == nullptr) return not_loaded();
+  const int64_t count = num_rows(qpos), share = rows_of_job(pool, count);
+  auto started = std::make_shared<Started>();
+  const Floats* const inputs[] = {&qpos, &qvel, &warmstart, &control};
+  size_t offsets[4];
+  for (int i = 0; i < 4; ++i) {
+    const float* values = inputs[i]->typed_data();
+    offsets[i] = started->inputs.size();
+    started->inputs.insert(started->inputs.end(), values, values + inputs[i]->element_count());
+  }
+  const size_t position = qpos.element_count(), velocity = qvel.element_count();
+  started->outputs.resize(position + 2 * velocity + count * derived_size);
+  const float* in = started->inputs.data();
+  float* out = started->outputs.data();
+  const Simulator::Rows rows{
+      in + offsets[0],    in + offsets[1],           in + offsets[2],
+      in + offsets[3],    out,                       out + position,
+      out + position + velocity, out + position + 2 * velocity,
+  };
+  const int64_t num_jobs = (count + share - 1) / share;
+  started->jobs = std::make_shared<Jobs>(num_jobs, [=](int64_t job) {
+    simulator->run(rows, job * share, std::min(count, (job + 1) * share), num_substeps);
+  });
+  int32_t number;
+  {
+    const std::lock_guard<std::mutex> lock(started_steps().mutex);
+    number = ++started_steps().last;
+    started_steps().by_ticket.emplace(number, started);
+  }
+  std::fill_n(ticket->typed_data(), ticket->element_count(), number);
+  std::copy_n(key.typed_data(), key.element_count(), same_key->typed_data());
+  offer(pool, started->jobs, num_jobs);
+  return ffi::Error::Success();
+}
+
+// Returns the results of the step that `start` began. `after` is not read: it is computed by what
+// must precede this call.
+ffi::Error finish(Tickets ticket, Floats after, ffi::Result<Floats> next_qpos,
+                  ffi::Result<Floats> next_qvel, ffi::Result<Floats> next_warmstart,
+                  ffi::Result<Floats> derived) {
+  std::shared_ptr<Started> started;
+  {
+    const std::lock_guard<std::mutex> lock(started_steps().mutex);
+    const auto found = started_steps().by_ticket.find(ticket.typed_data()[0]);
+    if (found == started_steps().by_ticket.end())
+      return ffi::Error(ffi::ErrorCode::kNotFound, "a step to finish was not started");
+    started = found->second;
+    started_steps().by_ticket.erase(found);
+  }
+  started->jobs->finish();
+  const float* from = started->outputs.data();
+  for (auto* to : {&next_qpos, &next_qvel, &next_warmstart, &derived}) {
+    std::copy_n(from, (*to)->element_count(), (*to)->typed_data());
+    from += (*to)->element_count();
+  }
   return ffi::Error::Success();
 }
 
@@ -178,6 +276,29 @@ XLA_FFI_DEFINE_HANDLER_SYMBOL(maxent_physics, step,
                                   .Arg<Floats>()
                                   .Attr<std::string_view>("model")
                                   .Attr<int64_t>("num_substeps")
+                                  .Ret<Floats>()
+                                  .Ret<Floats>()
+                                  .Ret<Floats>()
+                                  .Ret<Floats>());
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(maxent_physics_start, start,
+                              ffi::Ffi::Bind()
+                                  .Ctx<ffi::ThreadPool>()
+                                  .Arg<Floats>()
+                                  .Arg<Floats>()
+                                  .Arg<Floats>()
+                                  .Arg<Floats>()
+                                  .Arg<Words>()
+                                  .Attr<std::string_view>("model")
+                                  .Attr<int64_t>("num_substeps")
+                                  .Attr<int64_t>("derived_size")
+                                  .Ret<Tickets>()
+                                  .Ret<Words>());
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(maxent_physics_finish, finish,
+                              ffi::Ffi::Bind()
+                                  .Arg<Tickets>()
+                                  .Arg<Floats>()
                                   .Ret<Floats>()
                                   .Ret<Floats>()
                                   .Ret<Floats>()
