@@ -20,6 +20,7 @@ from benchmarks.gpu.sections import (
     device,
     env_steps,
     fidelity,
+    host_physics,
     kernels,
     neighbors,
     peers,
@@ -43,6 +44,7 @@ PARTS: dict[str, dict[str, Callable[[Session], Measure]]] = {
     "second": {
         "env steps": functools.partial(env_steps, ("walker2d", "humanoid"), ENVS[:1]),
         "updates": updates,
+        "host physics": host_physics,
         "fidelity": fidelity,
         "kernels": kernels,
         "peers": peers,

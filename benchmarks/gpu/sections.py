@@ -292,6 +292,39 @@ def updates(session: Session) -> Measure:
     return measure
 
 
+def host_physics(session: Session) -> Measure:
+    """Measures training with C MuJoCo on the host's cores, without and with a policy lag."""
+    name, sizes, steps = ("smoke", {}, 2) if session.toy else ("quick", {"num_envs": 256}, 20)
+    programs = []
+    for lag in (0, 1):
+        config = preset(name, env="ant", backend="mujoco", policy_lag=lag, num_segments=1, **sizes)
+        config = config.replace(steps_per_iteration=steps * config.budget.num_envs)
+        segment = functools.partial(algorithm.train_segment, config)
+        state = algorithm.start(config)
+        label = f"train_segment, C MuJoCo on the host, policy lag {lag}"
+        programs.append((config, state, session.compile(label, segment, state)))
+
+    def measure() -> Iterator[Row]:
+        rates: list[float] = []
+        for config, state, future in programs:
+            program = future.result()
+            yield program.row
+            filled, _ = program.call(state)
+            call = functools.partial(program.call, filled)
+            taken = common.median_seconds(call, 1 if session.toy else 3)
+            rates.append(config.budget.steps_per_iteration / taken)
+            yield {
+                "section": "host physics",
+                "envs": config.budget.num_envs,
+                "updates_per_step": config.budget.updates_per_step,
+                "policy_lag": config.learner.policy_lag,
+                "env_steps_per_second": rates[-1],
+                "over_no_lag": rates[-1] / rates[0],
+            }
+
+    return measure
+
+
 def fidelity(session: Session) -> Measure:
     """Compares MJX with the reference options and C MuJoCo: same states, same actions."""
     num_envs, num_steps = (2, 2) if session.toy else (256, 50)
