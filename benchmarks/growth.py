@@ -148,7 +148,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         "replay rows": "a gradient step",
         "reference points": "a vector step",
     }
-    figure = Figure(figsize=(9, 2.8), layout="constrained")
+    figure = Figure(figsize=(10, 2.8), layout="constrained")
     axes = figure.subplots(1, 3, sharey=True)
     for ax, (of, name) in zip(axes, what.items(), strict=True):
         own = [row for row in rows if row["of"] == of]
@@ -156,6 +156,10 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         ax.plot(numbers, [row["over_first"] for row in own], marker="o", label="measured")
         ax.plot(numbers, [n / numbers[0] for n in numbers], color="0.7", ls="--", label="linear")
         ax.set(xscale="log", yscale="log", xlabel=f"number of {of}", title=name, ylim=(0.7, 15))
+        labels = [f"{n:,}" if n < 10**6 else f"{n // 10**6} million" for n in numbers]
+        ax.set_xticks(numbers, labels=labels)
+        ax.minorticks_off()
+    axes[0].set_yticks([1, 2, 5, 10], labels=["1", "2", "5", "10"])
     axes[0].set_ylabel("time over the first")
     axes[0].legend(frameon=False)
     figure.savefig(path, dpi=150)

@@ -149,9 +149,10 @@ class Bar:
 
     def _spent(self) -> list[str]:
         c, vector_steps = self._config, self._done_segments() * self._config.vector_steps
+        learned = max(vector_steps - c.learner.policy_lag, 0)
         return [
             f"{vector_steps * c.budget.num_envs:,} env steps",
-            f"{vector_steps * c.updates_per_vector_step:,} updates",
+            f"{learned * c.updates_per_vector_step:,} updates",
         ]
 
     def _show(self) -> None:
