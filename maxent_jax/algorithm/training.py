@@ -165,8 +165,10 @@ def _step_beside(
 
     def work(key):
         learn = functools.partial(_learn, components, method, learner, drawn)
-        skip = lambda key: _unlearned(learner, *jax.eval_shape(learn, key))
-        learned, metrics = jax.lax.cond(ready, learn, skip, key)
+        _, metrics = jax.eval_shape(learn, key)
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metrics)
+        unlearned = Learned(learner.agent, learner.bonus), nothing
+        learned, metrics = jax.lax.cond(ready, learn, lambda _: unlearned, key)
         return (learned, metrics), learned.agent.parameters.log_temperature
 
     action = _action(components, learner, keys)
@@ -176,12 +178,6 @@ def _step_beside(
     learner = _updated(components, learner, learned, ready)
     learner, of_steps = _record(components, method, learner, episodes, everyone, keys)
     return learner, of_updates | of_steps
-
-
-def _unlearned(learner: Learner, _: Learned, metrics: Metrics) -> tuple[Learned, Metrics]:
-    """The result of no gradient steps: zeros for metrics."""
-    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), metrics)
-    return Learned(learner.agent, learner.bonus), zeros
 
 
 def _updated(
