@@ -230,22 +230,14 @@ def _programs(config: Config, seed_axis: bool) -> Programs:
 
 @functools.lru_cache(maxsize=8)
 def compiled(config: Config, jitted: Programs) -> Programs:
-    """Compiles the three functions for the config's state, two at a time.
-
-    Returns once `begin` and `train_segment` are compiled. `end`, which is needed last, is then
-    compiled while they run.
-    """
+    """Compiles the three functions for the config's state, in parallel."""
     state = jax.eval_shape(functools.partial(start, config))
 
     def compile_one(function: Any) -> Callable:
         return function.lower(state).compile()
 
-    pool = ThreadPoolExecutor(2)  # takes the longest first
-    train, begin, end = (
-        pool.submit(compile_one, f) for f in (jitted.train_segment, jitted.begin, jitted.end)
-    )
-    pool.shutdown(wait=False)
-    return Programs(begin.result(), train.result(), lambda state: end.result()(state))
+    with ThreadPoolExecutor(len(jitted)) as pool:
+        return Programs(*pool.map(compile_one, jitted))
 
 
 def functions(config: Config, seed_axis: bool) -> Programs:
