@@ -6,8 +6,6 @@ replay, or a large reference.
 
 import functools
 import itertools
-import statistics
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -33,13 +31,8 @@ MEASURED = 100_000  # rows of the replay that are measured against the reference
 
 def seconds(program: Callable, state: State, repeats: int) -> float:
     """Returns the median time of a program that donates its state, which stays intact."""
-    taken = []
-    for _ in range(repeats + 1):
-        own = jax.block_until_ready(jax.tree.map(jnp.copy, state))
-        started = time.perf_counter()
-        jax.block_until_ready(program(own))
-        taken.append(time.perf_counter() - started)
-    return statistics.median(taken[1:])
+    copies = iter([jax.tree.map(jnp.copy, state) for _ in range(repeats + 1)])
+    return common.median_seconds(lambda: program(next(copies)), repeats)
 
 
 def late(config: Config) -> State:
@@ -84,14 +77,8 @@ def replay_rows(settings: dict[str, Any], sizes, repeats: int) -> Iterator[dict[
         gigabytes = replay.num_bytes(state.learner.replay) / 1e9
         full = replay.ring_of(config, full=True)
         state = state._replace(learner=state.learner._replace(replay=full))
-        taken: dict[str, list[float]] = {"begin": [], "train_segment": []}
-        for _ in range(repeats + 1):  # each continues the last: a copy of the state would cost
-            for name, times in taken.items():
-                started = time.perf_counter()
-                state, _ = getattr(programs, name)(state)
-                jax.block_until_ready(state)
-                times.append(time.perf_counter() - started)
-        begin, segment = (statistics.median(times[1:]) for times in taken.values())
+        begin, state = common.continued_seconds(programs.begin, state, repeats)
+        segment, _ = common.continued_seconds(programs.train_segment, state, repeats)
         update = segment / (config.vector_steps * config.updates_per_vector_step)
         first = first or update
         yield {

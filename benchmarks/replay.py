@@ -77,13 +77,9 @@ def insert_seconds(config: Config, full: bool, repeats: int) -> float:
         if full
         else jnp.full(n, -1)
     )
-    carry = [ring_of(config, full), place]
-
-    def call():
-        carry[:] = inserts(tuple(carry))
-        return carry
-
-    return common.median_seconds(call, repeats) / NUM_INSERTS
+    start = ring_of(config, full), place
+    taken, _ = common.continued_seconds(lambda carry: (inserts(carry), None), start, repeats)
+    return taken / NUM_INSERTS
 
 
 def sample_seconds(config: Config, repeats: int) -> float:

@@ -19,13 +19,8 @@ def seconds_per_segment(config, repeats: int) -> float:
     """Returns the median time of a segment, after one to warm up; each continues the last."""
     programs = algorithm.programs(config)
     state, _ = programs.begin(algorithm.start(config))
-
-    def segment():
-        nonlocal state
-        state, metrics = programs.train_segment(state)
-        return state, metrics
-
-    return common.median_seconds(segment, repeats)
+    taken, _ = common.continued_seconds(programs.train_segment, state, repeats)
+    return taken
 
 
 def measure(name: str, settings: dict[str, Any], counts, repeats: int) -> Iterator[dict[str, Any]]:

@@ -123,18 +123,18 @@ def steps(
 
     # Batches are drawn right after the vector step before. Drawn later, they would make XLA copy
     # the replay, which the vector step changes in place.
-    def draw(learner, key):
-        return learner.replay.size > 0, _draw(components, learner, _keys(key).learn)
+    def draw(learner, key_learn):
+        return learner.replay.size > 0, _draw(components, learner, key_learn)
 
     def step_and_draw(carry, keys):
-        learner, drawn = carry
-        key, next_key = keys
-        ready, batches = drawn
-        learner, metrics = _step_beside(components, method, learner, ready, batches, key)
-        return (learner, draw(learner, next_key)), metrics
+        learner, (ready, batches) = carry
+        own, next_key_learn = keys
+        learner, metrics = _step_beside(components, method, learner, ready, batches, own)
+        return (learner, draw(learner, next_key_learn)), metrics
 
-    first = learner, draw(learner, keys[0])
-    (learner, _), metrics = jax.lax.scan(step_and_draw, first, (keys, jnp.roll(keys, -1)))
+    every = jax.vmap(_keys)(keys)
+    first = learner, draw(learner, every.learn[0])
+    (learner, _), metrics = jax.lax.scan(step_and_draw, first, (every, jnp.roll(every.learn, -1)))
     return learner, metrics
 
 
@@ -158,10 +158,10 @@ def _step_beside(
     learner: Learner,
     ready: jax.Array,
     drawn: Experience,
-    key: jax.Array,
+    keys: _Keys,
 ) -> tuple[Learner, Metrics]:
     """Steps all envs once; beside it, takes the gradient steps, if the draw holds anything."""
-    keys, length = _keys(key), components.config.environment.episode_length
+    length = components.config.environment.episode_length
 
     def work(key):
         learn = functools.partial(_learn, components, method, learner, drawn)

@@ -22,7 +22,6 @@ namespace ffi = xla::ffi;
 using maxent::Jobs;
 using maxent::num_threads;
 using maxent::offer;
-using maxent::parallel;
 using Floats = ffi::Buffer<ffi::F32>;
 using Words = ffi::Buffer<ffi::U32>;
 using Tickets = ffi::Buffer<ffi::S32>;
@@ -140,9 +139,21 @@ int64_t num_rows(const Floats& x) {
   return x.element_count() / shape[shape.size() - 1];
 }
 
-// Several jobs for each thread, since robots that lie on the ground take longer.
-int64_t rows_of_job(ffi::ThreadPool& pool, int64_t count) {
-  return std::max<int64_t>(1, count / (8 * num_threads(pool)));
+struct Divided {
+  std::shared_ptr<Jobs> jobs;
+  int64_t count;
+};
+
+// Divides a step of `count` rows into several jobs for each thread, since robots that lie on the
+// ground take longer.
+Divided divide(ffi::ThreadPool& pool, Simulator* simulator, const Simulator::Rows& rows,
+               int64_t count, int64_t num_substeps) {
+  const int64_t share = std::max<int64_t>(1, count / (8 * num_threads(pool)));
+  const int64_t num_jobs = (count + share - 1) / share;
+  auto jobs = std::make_shared<Jobs>(num_jobs, [=](int64_t job) {
+    simulator->run(rows, job * share, std::min(count, (job + 1) * share), num_substeps);
+  });
+  return {std::move(jobs), num_jobs};
 }
 
 ffi::Error step(ffi::ThreadPool pool, Floats qpos, Floats qvel, Floats warmstart, Floats control,
@@ -156,10 +167,9 @@ ffi::Error step(ffi::ThreadPool pool, Floats qpos, Floats qvel, Floats warmstart
       control.typed_data(),    next_qpos->typed_data(), next_qvel->typed_data(),
       next_warmstart->typed_data(), derived->typed_data(),
   };
-  const int64_t count = num_rows(qpos), share = rows_of_job(pool, count);
-  parallel(pool, (count + share - 1) / share, [&](int64_t job) {
-    simulator->run(rows, job * share, std::min(count, (job + 1) * share), num_substeps);
-  });
+  const Divided step = divide(pool, simulator, rows, num_rows(qpos), num_substeps);
+  offer(pool, step.jobs, step.count - 1);
+  step.jobs->finish();
   return ffi::Error::Success();
 }
 
@@ -188,7 +198,7 @@ ffi::Error start(ffi::ThreadPool pool, Floats qpos, Floats qvel, Floats warmstar
                  ffi::Result<Tickets> ticket, ffi::Result<Words> same_key) {
   Simulator* simulator = find(model);
   if (simulator == nullptr) return not_loaded();
-  const int64_t count = num_rows(qpos), share = rows_of_job(pool, count);
+  const int64_t count = num_rows(qpos);
   auto started = std::make_shared<Started>();
   const Floats* const inputs[] = {&qpos, &qvel, &warmstart, &control};
   size_t offsets[4];
@@ -206,10 +216,8 @@ ffi::Error start(ffi::ThreadPool pool, Floats qpos, Floats qvel, Floats warmstar
       in + offsets[3],    out,                       out + position,
       out + position + velocity, out + position + 2 * velocity,
   };
-  const int64_t num_jobs = (count + share - 1) / share;
-  started->jobs = std::make_shared<Jobs>(num_jobs, [=](int64_t job) {
-    simulator->run(rows, job * share, std::min(count, (job + 1) * share), num_substeps);
-  });
+  const Divided step = divide(pool, simulator, rows, count, num_substeps);
+  started->jobs = step.jobs;
   int32_t number;
   {
     const std::lock_guard<std::mutex> lock(started_steps().mutex);
@@ -218,7 +226,7 @@ ffi::Error start(ffi::ThreadPool pool, Floats qpos, Floats qvel, Floats warmstar
   }
   std::fill_n(ticket->typed_data(), ticket->element_count(), number);
   std::copy_n(key.typed_data(), key.element_count(), same_key->typed_data());
-  offer(pool, started->jobs, num_jobs);
+  offer(pool, step.jobs, step.count);
   return ffi::Error::Success();
 }
 
