@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from maxent_jax import envs, intrinsic
+from maxent_jax import envs, intrinsic, tasks
 from maxent_jax.config import Config, registry
+from maxent_jax.config import tasks as task_names
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs.base import Env
 from maxent_jax.envs.task import observation_size
@@ -29,6 +30,7 @@ class Components(NamedTuple):
     sac: agent.Sac
     phi: Features
     bonus: Bonus | None = None
+    task: tasks.Task | None = None
 
 
 def make(config: Config) -> Components:
@@ -64,7 +66,18 @@ def _make(config: Config) -> Components:
                 config.learner.learning_rate,
                 entry.grid.num_cells,
             )
-        return Components(config, env, entry.grid, entry.torso, num_seen, sac, phi, bonus)
+        found = Components(config, env, entry.grid, entry.torso, num_seen, sac, phi, bonus)
+        return with_task(found, config.downstream.task)
+
+
+@functools.lru_cache(maxsize=8)
+def with_task(components: Components, name: str) -> Components:
+    """Returns the components with the task of a name; with `none`, without a task."""
+    if name == task_names.NONE:
+        return components._replace(task=None)
+    task = tasks.make(name, components.config.env, components.env)
+    registry.in_use.add(("task", name))
+    return components._replace(task=task)
 
 
 def _units(config: Config, grid: Grid, num_features: int) -> jax.Array:

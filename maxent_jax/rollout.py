@@ -21,6 +21,7 @@ class Trajectories(NamedTuple):
     alive: jax.Array  # [T, E] bool: the episode had not ended, and the state is finite
     terminated: jax.Array  # [T, E] bool: the environment ended the episode at this state
     num_invalid: jax.Array  # [] int32, steps to a physics state that is not finite
+    env: State  # [T, E, ...] what the environment needs to go on from each state
 
 
 def episodes(
@@ -50,7 +51,7 @@ def episodes(
         # An ended episode waits at its start, so that broken physics is never stepped again.
         current = base.select_rows(goes_on, after, starts)
         num_invalid = jnp.sum(alive & ~valid, dtype=jnp.int32)
-        found = Trajectories(states, action, reached, reached & ~goes_on, num_invalid)
+        found = Trajectories(states, action, reached, reached & ~goes_on, num_invalid, after)
         return (current, goes_on), found
 
     everyone = jnp.ones(starts.done.shape[0], bool)

@@ -56,6 +56,7 @@ class Outcomes(NamedTuple):
     terminated: jax.Array  # [..., n] bool
     distances: Distances  # [..., n]
     taken: jax.Array  # [..., n] bool
+    task: jax.Array | None = None  # [..., n] the task's reward; None without a task
 
 
 class Experience(NamedTuple):

@@ -13,6 +13,7 @@ from untrained import make_run
 
 from maxent_jax import envs
 from maxent_jax.analysis import dataset
+from maxent_jax.errors import ConfigError
 
 LENGTH = 100  # the time limit of the preset
 
@@ -148,3 +149,14 @@ def test_what_is_not_finite_is_no_transition(last):
     np.testing.assert_array_equal(rows["next_observations"][:, 1], [1, 2, 3, 1, 2, 3, 1])
     np.testing.assert_array_equal(rows["timeouts"], [0, 0, 1, 0, 0, 1, 1])
     assert not rows["terminals"].any()
+
+
+def test_a_dataset_is_paid_for_a_task(run):
+    data = run.dataset(300, task="run:90")
+    moved = data["next_observations"][:, 1] - data["observations"][:, 1]
+    np.testing.assert_allclose(data["rewards"], moved / run.components.env.dt, atol=1e-4)
+    plain = run.dataset(300)
+    assert "rewards" not in plain
+    np.testing.assert_array_equal(plain["actions"], data["actions"])
+    with pytest.raises(ConfigError, match="task is flip, but ant has only"):
+        run.dataset(300, task="flip")

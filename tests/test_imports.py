@@ -14,7 +14,17 @@ PACKAGE = Path(maxent_jax.__file__).parent
 # The reading order of the package's folders and single modules, first to last.
 ORDER = (
     *("errors", "checks", "types", "precision", "moments", "config", "native", "density", "envs"),
-    *("rollout", "features", "rewards", "sac", "intrinsic", "components", "mixture", "algorithm"),
+    *(
+        "tasks",
+        "rollout",
+        "features",
+        "rewards",
+        "sac",
+        "intrinsic",
+        "components",
+        "mixture",
+        "algorithm",
+    ),
     *("baselines", "runs", "analysis", "visual", "theory", "studies", "commands", "__main__"),
 )
 

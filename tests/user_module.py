@@ -1,10 +1,10 @@
-"""An environment, a bonus and a method as a user adds them, through the public API alone."""
+"""An environment, a bonus, a method and a task as a user adds them, through the public API."""
 
 import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State
 
-from maxent_jax import envs, intrinsic
+from maxent_jax import envs, intrinsic, tasks
 from maxent_jax.config import register_method
 from maxent_jax.density.histogram import Grid
 
@@ -51,3 +51,4 @@ envs.register(
 )
 intrinsic.register("far", far_from_origin)
 register_method("newest", "last", 0, "mixture", "last", reward="linear")
+tasks.register("right", lambda observation, action, next_observation: next_observation[..., 0])

@@ -42,6 +42,7 @@ class Step(NamedTuple):
     bonus: jax.Array  # [] episodic term, feature units
     angle: jax.Array | None  # [V - 1] radians, the same throughout an episode; None without copies
     distances: Distances  # [V]
+    task: jax.Array | None = None  # [V] the task's reward; None without a task
 
 
 def init(components: Components) -> Replay:
@@ -58,6 +59,7 @@ def init(components: Components) -> Replay:
         bonus=scalar,
         angle=variants[1:] if config.learner.yaw_copies else None,
         distances=Distances(variants, variants, variants),
+        task=None if components.task is None else variants,
     )
     return replay.init(step, config.learner.replay_size)
 
@@ -101,6 +103,7 @@ def add(
         distances=measure(
             components, reference, _variants(components, transition.observation, angle), after
         ),
+        task=_task_rewards(components, transition, angle),
     )
     rows = replay.destinations(ring, transition.valid)
     ring = replay.add(ring, step, transition.valid)
@@ -159,6 +162,7 @@ def sample(
             terminated=items.terminated[steps],
             distances=jax.tree.map(lambda x: _chosen(x[steps], of_variant), items.distances),
             taken=jnp.stack(taken, axis=-1),
+            task=None if items.task is None else _chosen(items.task[steps], of_variant),
         ),
         row=first,
     )
@@ -198,6 +202,9 @@ def measure(
         )
         return nearest[:, -1].reshape(features.shape[:-1])
 
+    if not config.explores:  # no reward depends on them
+        nothing = jnp.zeros(after.shape[:-1])
+        return Distances(nothing, nothing, nothing)
     reached = distance(after)
     if config.intrinsic.shaping == 0:
         return Distances(reached, jnp.zeros_like(reached), jnp.zeros_like(reached))
@@ -223,6 +230,21 @@ def _features_left(
         angle = None if items.angle is None else items.angle[rows]
         of_start = _variants(components, starts[start], angle)
     return jnp.where(in_ring[..., None, None], items.features[row], of_start)
+
+
+def _task_rewards(
+    components: Components, transition: Transition, angle: jax.Array | None
+) -> jax.Array | None:
+    """Rewards [N, V] of the task for transitions and their copies; None without a task."""
+    if components.task is None:
+        return None
+    pay, (observation, action, next_observation, *_) = components.task.reward, transition
+    own = pay(observation, action, next_observation)[:, None]
+    if angle is None:
+        return own
+    turned = [_rotated(components, s[:, None], angle) for s in (observation, next_observation)]
+    actions = jnp.broadcast_to(action[:, None], (*angle.shape, action.shape[-1]))
+    return jnp.concatenate([own, pay(turned[0], actions, turned[1])], axis=-1)
 
 
 def _variants(components: Components, state: jax.Array, angle: jax.Array | None) -> jax.Array:

@@ -94,7 +94,12 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
     key_starts, key_rollout, key_rows, key_history, key_scratch = keys
 
     weights = method.weights[archive.size - 1]
-    starts = base.draw_starts(learner.episodes.starts, config.mixture.mixture_episodes, key_starts)
+    if not config.explores:  # nothing depends on what the mixture visits
+        chosen = _start(p, method, archive, learner.agent, archive.size - 1, key_scratch)
+        learner = learner._replace(agent=chosen)
+        return state._replace(key=key, learner=learner), {"weights": weights}
+    pool = base.only_starts(learner.episodes)
+    starts = base.draw_starts(pool, config.mixture.mixture_episodes, key_starts)
     visited = occupancy.of_mixture(p, archive, weights, starts, key_rollout)
     visited, weights = occupancy.corrected(p, visited, weights)
 
@@ -167,9 +172,8 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
     key_starts, key_rollout, key_rows = jax.random.split(jax.random.key(EVALUATION_SEED), 3)
 
     def roll_out(weights, key_starts, key_rollout):
-        starts = base.draw_starts(
-            learner.episodes.starts, config.mixture.mixture_episodes, key_starts
-        )
+        pool = base.only_starts(learner.episodes)
+        starts = base.draw_starts(pool, config.mixture.mixture_episodes, key_starts)
         deterministic = p.config.evaluation.deterministic
         return occupancy.of_mixture(p, archive, weights, starts, key_rollout, True, deterministic)
 
@@ -180,9 +184,10 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
         _, weights = occupancy.corrected(p, fitted_to, weights)
     visited = roll_out(weights, key_starts, key_rollout)
     state = state._replace(iteration=state.iteration + 1, archive=archive)
+    first_steps = 0 if learner.first_steps is None else learner.first_steps
     metrics = {
         "iteration": state.iteration,
-        "env_steps": learner.env_steps,
+        "env_steps": learner.env_steps + first_steps,
         "gradient_steps": learner.gradient_steps,
         "mixture_weights": weights,
         "effective_policies": jnp.exp(histogram.shannon_entropy(weights)),

@@ -23,6 +23,7 @@ from maxent_jax.sac.agent import Agent
 from maxent_jax.sac.replay import Replay
 from maxent_jax.types import Experience, Metrics, Outcomes, Transition
 
+NUM_RESTARTS = 1024  # at most, see base.Restarts
 SMALLEST_SIZE = 1e-8  # standard deviation by which a bonus is divided
 
 
@@ -48,6 +49,7 @@ class Learner(NamedTuple):
     random_visits: Visits
     env_steps: jax.Array  # [] int32, of the agent
     gradient_steps: jax.Array  # [] int32
+    first_steps: jax.Array | None = None  # [] int32, env steps before training, see finetune
 
 
 class Learned(NamedTuple):
@@ -60,16 +62,20 @@ class Learned(NamedTuple):
 def init(components: Components, key: jax.Array) -> Learner:
     """Returns a new learner with new episodes, an empty replay and an empty reference."""
     config, sac = components.config, components.sac
+    zero = jnp.zeros((), jnp.int32)
     key_agent, key_episodes, key_bonus = jax.random.split(key, 3)
     num_rows = config.budget.num_envs * (2 if config.evaluation.random_baseline else 1)
     dims = len(components.phi.names)
     episodes = base.init(components.env, num_rows, config.environment.num_starts, key_episodes)
+    if config.downstream.restart_share:  # until finetune puts others in their place
+        restarts = jax.tree.map(lambda x: x[:NUM_RESTARTS], episodes.starts)
+        no_age = jnp.zeros(restarts.done.shape, jnp.int32)
+        episodes = base.with_restarts(episodes, restarts, base.Restarts(jnp.zeros(()), no_age))
     episodic = components.bonus and components.bonus.episodic
     remembered = episodic.size if episodic else dims
     memory = None
     if config.intrinsic.episodic_weight > 0 or episodic:
         memory = jnp.zeros((config.budget.num_envs, config.environment.episode_length, remembered))
-    zero = jnp.zeros((), jnp.int32)
     unvisited = Visits(jnp.zeros(components.grid.bins, jnp.int32), zero)
     return Learner(
         agent=sac_agent.init(sac, key_agent),
@@ -84,6 +90,7 @@ def init(components: Components, key: jax.Array) -> Learner:
         random_visits=unvisited,
         env_steps=zero,
         gradient_steps=zero,
+        first_steps=None if components.task is None else zero,
     )
 
 
@@ -246,6 +253,9 @@ def _record(
         metrics["flipped_share"] = jnp.mean(flipped.astype(jnp.float32))
     reached = ring.items.distances.reached.at[rows, 0].get(mode="fill", fill_value=1.0)
     num_valid = jnp.maximum(jnp.sum(transition.valid), 1)
+    if ring.items.task is not None:
+        earned = ring.items.task.at[rows, 0].get(mode="fill", fill_value=0.0)
+        metrics["task_step_reward"] = jnp.sum(earned * transition.valid) / num_valid
     metrics |= {
         "step_reward": jnp.sum(unshaped_reward(components, reached) * transition.valid) / num_valid,
         "num_deaths": jnp.sum(transition.terminated, dtype=jnp.int32),
@@ -267,7 +277,7 @@ def unshaped_reward(components: Components, distance: jax.Array) -> jax.Array:
 
 
 def reward(components: Components, outcomes: Outcomes) -> jax.Array:
-    """Returns the reward that SAC receives, [...]: r_t, shaping, episodic term, alive bonus."""
+    """Returns the intrinsic reward of SAC, [...]: r_t, shaping, episodic term, alive bonus."""
     own, distances = components.config.intrinsic, outcomes.distances
     paid = unshaped_reward(components, distances.reached) + own.episodic_weight * outcomes.bonus
     if own.shaping > 0:
@@ -282,6 +292,19 @@ def reward(components: Components, outcomes: Outcomes) -> jax.Array:
             survives_death=own.shaping_survives_death,
         )
     return own.reward_scale * paid + _for_living(components, outcomes)
+
+
+def with_task(
+    components: Components, learner: Learner, intrinsic: jax.Array, outcomes: Outcomes
+) -> jax.Array:
+    """Returns the task's reward plus β times the intrinsic reward, [..., n], if there is a task."""
+    if outcomes.task is None:
+        return intrinsic
+    own = components.config.downstream
+    weight = jnp.asarray(own.intrinsic_weight)
+    if own.intrinsic_decay:
+        weight *= jnp.maximum(1.0 - learner.env_steps / own.intrinsic_decay, 0.0)
+    return own.task_scale * outcomes.task + weight * intrinsic
 
 
 def _for_living(components: Components, outcomes: Outcomes) -> jax.Array:
@@ -382,11 +405,17 @@ def _learn(
     else:
         key_bonus = jax.random.fold_in(key, 2)
         bonus, paid, of_bonus = _paid_by_bonus(components, learner, drawn, key_bonus)
+    paid = with_task(components, learner, paid, outcomes)
     total, beyond = returns(outcomes, paid, config.learner.discount)
     batches = losses.Batch(drawn.observation, drawn.action, total, drawn.next_observation, beyond)
 
+    only_critics = None
+    if config.downstream.critic_steps:
+        only_critics = learner.env_steps <= config.downstream.critic_steps
+
     def update(agent, batch_and_key):
-        return sac_agent.update(components.sac, agent, *batch_and_key)
+        batch, key = batch_and_key
+        return sac_agent.update(components.sac, agent, batch, key, only_critics)
 
     keys = jax.random.split(key_update, config.updates_per_vector_step)
     agent, metrics = jax.lax.scan(update, learner.agent, (batches, keys))

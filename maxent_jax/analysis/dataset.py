@@ -1,6 +1,8 @@
 """Transitions of a mixture's episodes, for offline reinforcement learning."""
 
 import functools
+import itertools
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,8 @@ from maxent_jax import mixture
 from maxent_jax.checks import check_whole
 from maxent_jax.components import Components
 from maxent_jax.config import Config
+from maxent_jax.envs.base import State
+from maxent_jax.envs.physics import PhysicsState
 from maxent_jax.mixture import Archive, occupancy
 from maxent_jax.runs import memory
 
@@ -45,10 +49,11 @@ def collect(
     An episode is cut at its time limit, before a step whose state is not finite, and at the last
     row. Every episode's last row is a terminal or a timeout, and no other row is either.
 
-    There is no reward, because the run has none. To add one, rate the states reached: use
-    `rewards.knn_reward(features, ...)`, or your own task on `next_observations`.
+    With a task there is also its reward, `rewards` [n] float32. An intrinsic reward can be computed
+    from the states reached, by `rewards.knn_reward(features, ...)`.
 
     Args:
+      components: of the run; its task is the one that is rewarded.
       weights: [P] of the policies.
       num: n. EPISODES_AT_ONCE episodes are in memory in addition to the rows.
     Returns:
@@ -59,24 +64,52 @@ def collect(
     check(components.config, num)
     rows: dict[str, np.ndarray] = {}
     filled = 0
-    while filled < num:
-        key, key_episodes = jax.random.split(key)
-        found = _in_order(*_episodes(components, archive, weights, key_episodes))
+    for found in stream(components, archive, weights, key):
         if not rows:
             rows = {name: np.empty((num, *x.shape[1:]), x.dtype) for name, x in found.items()}
         taken = min(num - filled, len(found["policy"]))
-        if taken == 0:
-            raise ValueError(f"none of the {EPISODES_AT_ONCE} episodes has a finite first step")
         for name, x in found.items():
             rows[name][filled : filled + taken] = x[:taken]
         filled += taken
+        if filled == num:
+            break
     rows["timeouts"][-1] = not rows["terminals"][-1]
     return rows
 
 
-@functools.partial(jax.jit, static_argnums=0)
+def stream(
+    components: Components,
+    archive: Archive,
+    weights: jax.Array,
+    key: jax.Array,
+    first: int = 0,
+    physics: bool = False,
+) -> Iterator[dict[str, np.ndarray]]:
+    """Yields the transitions of EPISODES_AT_ONCE episodes again and again, without an end.
+
+    Args:
+      weights: [P] of the policies.
+      first: how many times to skip.
+      physics: also yield the simulator's state before and after each transition, `physics` and
+        `next_physics` [n, Q] float32: qpos and qvel of a MuJoCo model.
+    Yields:
+      The arrays of `collect`.
+    Raises:
+      ValueError: no episode has a finite first step.
+    """
+    for i in itertools.count():
+        key, key_episodes = jax.random.split(key)
+        if i < first:
+            continue
+        found = _in_order(*_episodes(components, archive, weights, physics, key_episodes))
+        if not len(found["policy"]):
+            raise ValueError(f"none of the {EPISODES_AT_ONCE} episodes has a finite first step")
+        yield found
+
+
+@functools.partial(jax.jit, static_argnums=(0, 3))
 def _episodes(
-    components: Components, archive: Archive, weights: jax.Array, key: jax.Array
+    components: Components, archive: Archive, weights: jax.Array, physics: bool, key: jax.Array
 ) -> tuple[dict[str, jax.Array], jax.Array]:
     """[T, E, ...] of each key, and [T, E] bool: the entries that are transitions."""
     key_starts, key_assign, key_order, key_play = jax.random.split(key, 4)
@@ -96,7 +129,22 @@ def _episodes(
         "policy": jnp.broadcast_to(policy, reached.alive.shape),
         "features": components.phi(reached.states),
     }
+    if components.task is not None:
+        pay = components.task.reward
+        rows["rewards"] = pay(rows["observations"], reached.actions, reached.states)
+    if physics:
+        rows["next_physics"] = _simulator_state(reached.env)
+        first = _simulator_state(starts)[None]
+        rows["physics"] = jnp.concatenate([first, rows["next_physics"][:-1]])
     return rows, reached.alive
+
+
+def _simulator_state(env: State) -> jax.Array:
+    """[..., Q] of states with as many leading axes as `done`."""
+    state = env.pipeline_state
+    parts = (state.qpos, state.qvel) if isinstance(state, PhysicsState) else jax.tree.leaves(state)
+    lead = env.done.shape
+    return jnp.concatenate([x.reshape(*lead, -1).astype(jnp.float32) for x in parts], axis=-1)
 
 
 def _in_order(rows: dict[str, jax.Array], there: jax.Array) -> dict[str, np.ndarray]:

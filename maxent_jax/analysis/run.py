@@ -17,7 +17,7 @@ from maxent_jax.algorithm import methods
 from maxent_jax.analysis import dataset, export
 from maxent_jax.checks import check_path, check_whole
 from maxent_jax.components import Components
-from maxent_jax.config import Config
+from maxent_jax.config import Config, tasks
 from maxent_jax.config.registry import CORRECTIVE
 from maxent_jax.density import histogram
 from maxent_jax.mixture import Archive, occupancy
@@ -169,17 +169,23 @@ class Run:
         return paths(self.occupancy(episodes_per_policy, seed))
 
     @in_32_bits
-    def dataset(self, n: int, seed: int = 0) -> dict[str, np.ndarray]:
+    def dataset(self, n: int, seed: int = 0, task: str = tasks.NONE) -> dict[str, np.ndarray]:
         """Collects `n` transitions of the mixture's fresh episodes, for offline RL.
 
         `np.savez_compressed(path, **run.dataset(n))` saves them; `dataset.collect` lists the keys.
 
+        Args:
+          n: how many.
+          seed: of the episodes.
+          task: adds the rewards of this task, by name as in `config.tasks`; none adds none.
         Raises:
           ValueError: n < 1, or the transitions do not fit into memory.
+          ConfigError (a ValueError): the environment has no such task.
         """
         dataset.check(self.config, n)
+        on_task = components.with_task(self.components, task)
         weights, key = jnp.asarray(self.weights), jax.random.key(seed)
-        return dataset.collect(self.components, self.mixture, weights, n, key)
+        return dataset.collect(on_task, self.mixture, weights, n, key)
 
     @in_32_bits
     def scores(self, visited: Occupancy, seed: int = 0) -> Scores:

@@ -33,6 +33,8 @@ Modules = Annotated[
 """The type of a field for --import, which can be repeated."""
 COMMANDS = {
     "train": "train a mixture of policies that covers the state space",
+    "finetune": "train a run's policies on a task",
+    "dataset": "write transitions of a run's mixture for offline learning",
     "evaluate": "roll out a run's mixture again: entropy, coverage, returns",
     "render": "film a run's policies",
     "report": "write an HTML page about one or several runs",

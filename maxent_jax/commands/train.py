@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 from maxent_jax import errors
 from maxent_jax.checks import check_path
 from maxent_jax.commands import cli
-from maxent_jax.config import Config, preset, registry
-from maxent_jax.runs import files, runtime
+from maxent_jax.config import Config, preset, registry, tasks
+from maxent_jax.runs import files, runtime, source
 from maxent_jax.runs.claim import Claim
 from maxent_jax.runs.loggers import Sinks
 
@@ -70,12 +70,20 @@ class Arguments:
     def directory(self) -> Path:
         """The run's directory: --out, or one named after its settings."""
         c = self.config
-        return self.out or Path("runs") / f"{c.env}-{c.method}-{c.preset}-{c.seed}"
+        paid_by = c.method
+        if c.downstream.task != tasks.NONE:
+            paid_by += f"-{as_file_name(c.downstream.task)}"
+        return self.out or Path("runs") / f"{c.env}-{paid_by}-{c.preset}-{c.seed}"
 
     @property
     def claim(self) -> Claim:
         """What the run asks of its directory."""
         return Claim(self.directory, self.config, self.resume, self.overwrite)
+
+
+def as_file_name(task: str) -> str:
+    """Returns the name of a task as a part of a file name: goal:15,0 is goal_15_0."""
+    return re.sub(r"[^\w.-]", "_", task)
 
 
 def read_arguments(argv: Sequence[str]) -> Arguments:
@@ -89,16 +97,27 @@ def read_arguments(argv: Sequence[str]) -> Arguments:
     cli.import_modules(argv)
     default = Arguments(_default_config(argv))
     arguments = cli.parse(Arguments, argv, "train", default=default, shown=SHOWN)
+    check_arguments(arguments)
+    return arguments
+
+
+def check_arguments(arguments: Arguments) -> None:
+    """Checks arguments that were parsed.
+
+    Raises:
+      UsageError, ConfigError, RunError: an argument is invalid.
+    """
     arguments.config.check_registered()
+    source.check(arguments.config)
     _check_saving(arguments)
     _check_hosts(arguments)
     Sinks(arguments.tensorboard, arguments.wandb).check()
-    return arguments
 
 
 def _default_config(argv: Sequence[str]) -> Config:
     """The config that flags change: a preset, or that of the run to resume."""
-    values = {name: cli.flag_value(argv, f"--{name}") for name in ("preset", "env", "method")}
+    shaping = ("preset", "env", "method", "task")  # what defaults depend on
+    values = {name: cli.flag_value(argv, f"--{name}") for name in shaping}
     given = {name: value for name, value in values.items() if value}
     out = cli.flag_value(argv, "--out")
     if "--resume" in argv and out and not given and Path(out, files.CONFIG).exists():
@@ -166,7 +185,15 @@ def _check_hosts(arguments: Arguments) -> None:
 def main(argv: Sequence[str]) -> None:
     """Parses and checks the arguments, and only then loads jax."""
     started = time.perf_counter()
-    arguments = read_arguments(argv)
+    run(read_arguments(argv), started)
+
+
+def run(arguments: Arguments, started: float) -> None:
+    """Trains the run of checked arguments, and prints where its figures are.
+
+    Args:
+      started: time.perf_counter() when the program began.
+    """
     config, num_devices = arguments.config, arguments.devices
     arguments.claim.check()
     headless.draw_nothing()

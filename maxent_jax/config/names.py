@@ -10,3 +10,5 @@ MIXINGS = ("episode", "step")
 WEIGHTS = ("method", *registry.WEIGHTS)
 REFERENCES = ("method", *registry.REFERENCES)
 STARTS = ("method", *registry.STARTS)
+PLAYING = ("best", "mixture", "both")  # what plays first episodes
+STARTED_FROM = ("scratch", "last", *PLAYING)

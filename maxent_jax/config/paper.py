@@ -43,6 +43,10 @@ _PAPER: dict[str, tuple[Any, str]] = {
     "normalize_inputs": (False, "network inputs have mean 0 and standard deviation 1"),
     "policy_lag": (0, "gradient steps do not see the newest steps of the environments"),
     "actor_average": (0.0, "a moving average of the actor is archived"),
+    "task": ("none", "a task is rewarded"),
+    "start_from": ("scratch", "training starts from what another run learned"),
+    "restart_share": (0.0, "episodes also begin at states within earlier episodes"),
+    "critic_steps": (0, "at first only the critics learn"),
     "restart_temperature": (False, "the temperature is reset at each iteration"),
 }
 

@@ -105,6 +105,8 @@ def _baseline(bonus: str) -> MethodRow:
     return MethodRow("last", 0, "mixture", "last", _AS_PUBLISHED | {"bonus": bonus})
 
 
+TASK = "task"  # the method that is paid by a task alone
+
 METHODS = {
     "h": MethodRow("geometric", 0, "mixture", "scratch"),
     "la": MethodRow("uniform", 1, "history", "last"),
@@ -114,6 +116,18 @@ METHODS = {
         _AS_PUBLISHED | {"bonus": "histogram", "mixing": "step", "leave_own_out": False},
     ),
     **{name: _baseline(name) for name, row in BONUSES.items() if row.baseline},
+    TASK: MethodRow(
+        *("last", 0, "history", "last"),
+        dict(
+            intrinsic_weight=0.0,
+            shaping=0.0,
+            episodic_weight=0.0,
+            alive_bonus=0.0,
+            snapshots=1,
+            restart_temperature=False,
+            random_baseline=False,
+        ),
+    ),
 }
 
 ENVS = tuple(ENVIRONMENTS)
@@ -125,6 +139,7 @@ _REGISTERED_BY = {
     "environment": "maxent_jax.envs.register",
     "bonus": "maxent_jax.intrinsic.register",
     "method": "maxent_jax.config.register_method",
+    "task": "maxent_jax.tasks.register",
 }
 
 in_use: set[tuple[str, str]] = set()

@@ -2,10 +2,12 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
+
+import tyro
 
 from maxent_jax.checks import check_choice
-from maxent_jax.config import paper, presets, registry, validation
+from maxent_jax.config import paper, presets, registry, tasks, validation
 from maxent_jax.config.registry import BY_METHOD, CORRECTIVE
 from maxent_jax.errors import ConfigError, ConfigTypeError
 
@@ -15,7 +17,8 @@ class _Checked:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
-            value = validation.of_type(field.name, getattr(self, field.name), field.type)
+            kind = getattr(field.type, "__origin__", field.type)  # of Annotated
+            value = validation.of_type(field.name, getattr(self, field.name), kind)
             object.__setattr__(self, field.name, value)
 
 
@@ -168,6 +171,36 @@ class Learner(_Checked):
 
 
 @dataclasses.dataclass(frozen=True)
+class Downstream(_Checked):
+    """A task, and the run whose policies solve it (docs/how-to/finetune.md)."""
+
+    task: str = tasks.NONE
+    """Task that is rewarded too: none, gymnasium, forward, run:DEGREES, goal:X,Y, ... (all of them:
+    docs/how-to/finetune.md) or user:NAME."""
+    task_scale: float = 1.0
+    """Scale of the task's reward."""
+    intrinsic_weight: float = 1.0
+    """β: factor on the intrinsic reward."""
+    intrinsic_decay: int = 0
+    """Env steps after which β has fallen to 0, linearly; 0: it does not fall."""
+    source: str = ""
+    """Directory of the run to start from."""
+    source_seed: int = 0
+    """Which seed of that run, from 0, if it has several."""
+    restart_share: float = 0.0
+    """Share of the episodes that begin at a state of the best tenth of the first episodes."""
+    critic_steps: int = 0
+    """Env steps at the beginning in which only the critics learn."""
+    restart_critics: bool = True
+    """Start with new critics: those of that run have learned another reward."""
+    start_from: Annotated[str, tyro.conf.arg(aliases=("--from",))] = "scratch"
+    """What to take from that run: scratch (nothing), last (its newest agent), best (the agent with
+    the highest return in the first episodes), mixture (those episodes, for the replay), or both."""
+    first_episodes: int = 2
+    """Episodes that each policy of that run plays first, for best, mixture and both."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Evaluation(_Checked):
     """What is measured in addition to training."""
 
@@ -184,7 +217,8 @@ class Config(_Checked):
     env: str = "ant"
     """ant, walker2d, humanoid, pendulum, mountain_car, brax:NAME, or user:NAME (see --import)."""
     method: str = "v"
-    """h (Hazan 2019), la (Liu & Abbeel 2021), v (Veritas), h-official, or a bonus as a baseline."""
+    """h (Hazan 2019), la (Liu & Abbeel 2021), v (Veritas), h-official, a bonus as a baseline, or
+    task (one policy, paid by --task alone)."""
     preset: str = "quick"
     """Defaults of the other flags: smoke, quick, gpu or paper (docs/concepts/presets.md)."""
     seed: int = 0
@@ -197,6 +231,7 @@ class Config(_Checked):
     intrinsic: Intrinsic = Intrinsic()
     mixture: Mixture = Mixture()
     learner: Learner = Learner()
+    downstream: Downstream = Downstream()
     evaluation: Evaluation = Evaluation()
 
     def __post_init__(self) -> None:
@@ -218,6 +253,11 @@ class Config(_Checked):
     def archive_size(self) -> int:
         """P: policies in a full archive, the initial one and those of each iteration."""
         return 1 + self.budget.num_iterations * self.mixture.snapshots
+
+    @property
+    def explores(self) -> bool:
+        """Whether an intrinsic reward is paid, and not a task's alone."""
+        return self.downstream.intrinsic_weight > 0
 
     @property
     def simulates_in_jax(self) -> bool:
@@ -254,8 +294,9 @@ class Config(_Checked):
         return from_flat({**self.flat(), **changes})
 
     def check_registered(self) -> None:
-        """Raises ConfigError if a user's environment, method or bonus is not registered."""
+        """Raises ConfigError if a user's environment, method, bonus or task is not registered."""
         registry.check_registered(self.env, self.method, self.intrinsic.bonus)
+        tasks.check_registered(self.downstream.task)
 
     def program(self) -> "Config":
         """Returns this config with the settings that are data, not program, at their defaults.
@@ -292,6 +333,7 @@ DATA_FIELDS = (
     *("method", "preset", "seed", "num_seeds"),
     *("weights", "eta", "reference", "refresh_period", "start"),
     *("plateau_segments", "plateau_tolerance"),
+    *("source", "source_seed", "start_from", "first_episodes"),
 )
 
 
@@ -327,7 +369,8 @@ def preset(name: str, **changes: Any) -> Config:
     in_env = presets.IN_ENV.get((name, env), {})
     of_method = registry.method(method).settings
     of_both = presets.OF_METHOD_IN_ENV.get((name, env, method), {})
-    settings = {**presets.PRESETS[name], **in_env, **of_method, **of_both}
+    of_task = tasks.settings(changes.get("task", tasks.NONE), env)
+    settings = {**presets.PRESETS[name], **in_env, **of_method, **of_both, **of_task}
     return from_flat({"preset": name, **settings, **changes})
 
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from maxent_jax.checks import check_choice, check_number, check_whole
-from maxent_jax.config import names, presets, registry
+from maxent_jax.config import names, presets, registry, tasks
 from maxent_jax.config.registry import BY_METHOD, CORRECTIVE, EnvironmentRow
 from maxent_jax.errors import ConfigError, ConfigTypeError
 
@@ -19,10 +19,11 @@ _CHOICES = {
     "weights": names.WEIGHTS,
     "reference": names.REFERENCES,
     "start": names.STARTS,
+    "start_from": names.STARTED_FROM,
 }
 _AT_LEAST_ONE = (
     *("num_seeds", "num_iterations", "steps_per_iteration", "num_envs", "num_segments"),
-    "snapshots",
+    *("snapshots", "first_episodes"),
     *("episode_length", "num_starts", "num_neighbors", "reference_size", "mixture_episodes"),
     *("hidden_layers", "hidden_size", "batch_size", "replay_size", "return_steps"),
 )
@@ -31,12 +32,22 @@ _UNROLLED = {"hidden_layers": 64, "num_neighbors": 256, "return_steps": 256}
 MOST = 2**31 - 1  # rows and steps are counted in 32 bits
 _POSITIVE = (
     *("updates_per_step", "torque_limit", "reward_distance", "reward_scale", "learning_rate"),
-    *("soft_update_rate", "initial_temperature", "eta"),
+    *("soft_update_rate", "initial_temperature", "eta", "task_scale"),
 )
-_AT_MOST_ONE = ("torque_limit", "discount", "soft_update_rate", "eta", "actor_average")
+_AT_MOST_ONE = (
+    *("torque_limit", "discount", "soft_update_rate", "eta", "actor_average", "restart_share"),
+)
 _NOT_NEGATIVE = (
     *("seed", "plateau_segments", "plateau_tolerance", "shaping", "episodic_weight"),
-    *("alive_bonus", "actor_average"),
+    *(
+        "alive_bonus",
+        "actor_average",
+        "intrinsic_weight",
+        "intrinsic_decay",
+        "source_seed",
+        "critic_steps",
+        "restart_share",
+    ),
     *("yaw_copies", "discount", "target_entropy_scale", "policy_lag"),
 )
 
@@ -97,6 +108,8 @@ def check(env: str, method: str, settings: Mapping[str, Any]) -> None:
         most = _UNROLLED.get(name, MOST)
         if settings[name] > most:
             raise ConfigError(f"{_flag(name)} is {settings[name]}, but must be at most {most}.")
+    if settings["task"] != tasks.NONE:
+        tasks.parse(settings["task"], env)
     _check_together(SimpleNamespace(**settings), row)
 
 
@@ -216,6 +229,23 @@ def _check_together(c: SimpleNamespace, row: EnvironmentRow) -> None:
             updates * c.batch_size <= _neighbors_of(c.bonus),
             f"batch-size is {c.batch_size}, but bonus {c.bonus} needs more than "
             f"{_neighbors_of(c.bonus)} transitions in the {updates:g} batches of a vector step.",
+        ),
+        (
+            c.intrinsic_weight == 0 and c.task == tasks.NONE,
+            f"{'method is task' if c.method == registry.TASK else 'intrinsic-weight is 0'}, but "
+            "task is none: name a task.",
+        ),
+        (
+            c.intrinsic_decay and c.intrinsic_weight == 0,
+            f"intrinsic-decay is {c.intrinsic_decay}, but intrinsic-weight is 0: leave one out.",
+        ),
+        (
+            c.start_from != "scratch" and not c.source,
+            f"start-from is {c.start_from}, but there is no source: name the directory of a run.",
+        ),
+        (
+            c.start_from in names.PLAYING and c.task == tasks.NONE,
+            f"start-from is {c.start_from}, but task is none: name the task that is measured.",
         ),
         (c.policy_lag > 1, f"policy-lag is {c.policy_lag}, but must be 0 or 1."),
         (

@@ -18,14 +18,27 @@ Tree = TypeVar("Tree")
 __all__ = [
     "Env",
     "Episodes",
+    "Restarts",
     "State",
+    "begin_again",
+    "draw_rows",
     "draw_starts",
     "finite_rows",
     "init",
+    "only_starts",
+    "rows_of",
     "select_rows",
     "step",
     "step_beside",
+    "with_restarts",
 ]
+
+
+class Restarts(NamedTuple):
+    """States within earlier episodes, at which some episodes begin instead of at a start."""
+
+    share: jax.Array  # [] of the episodes that begin at one
+    age: jax.Array  # [Q] int32, of each: the pool's last Q rows
 
 
 class Episodes(NamedTuple):
@@ -35,24 +48,35 @@ class Episodes(NamedTuple):
     age: jax.Array  # [N] int32, control steps since the start of the episode
     start: jax.Array  # [N] int32, row of its start in the pool
     starts: State  # [R, ...] the pool, R far larger than N: a single start biases entropy
+    restarts: Restarts | None = None
 
 
 def init(env: Env, num_envs: int, num_starts: int, key: jax.Array) -> Episodes:
     """Begins N episodes, from a pool of `num_starts` random starts."""
     key_starts, key_draw = jax.random.split(key)
     starts = jax.vmap(env.reset)(jax.random.split(key_starts, num_starts))
-    start = _draw_rows(starts, num_envs, key_draw)
+    start = draw_rows(starts, num_envs, key_draw)
     return Episodes(
-        env=_rows(starts, start),
+        env=rows_of(starts, start),
         age=jnp.zeros(num_envs, jnp.int32),
         start=start,
         starts=starts,
     )
 
 
+def draw_rows(starts: State, num: int, key: jax.Array) -> jax.Array:
+    """Draws `num` rows of a pool of starts, independently of each other, [num] int32."""
+    return jax.random.randint(key, (num,), 0, starts.done.shape[0])
+
+
+def rows_of(states: State, rows: jax.Array) -> State:
+    """Returns the states in these rows, [R, ...] and [N] -> [N, ...]."""
+    return jax.tree.map(lambda x: x[rows], states)
+
+
 def draw_starts(starts: State, num: int, key: jax.Array) -> State:
     """Draws `num` starts from the pool, independently of each other, [num, ...]."""
-    return _rows(starts, _draw_rows(starts, num, key))
+    return rows_of(starts, draw_rows(starts, num, key))
 
 
 def step(
@@ -69,7 +93,8 @@ def step(
     Returns:
       The episodes after the step, and the transitions [N, ...].
     """
-    return _goes_on(episodes, jax.vmap(env.step)(episodes.env, action), action, episode_length, key)
+    after = jax.vmap(env.step)(episodes.env, action)
+    return _goes_on(episodes, after, action, episode_length, key)
 
 
 def step_beside(
@@ -114,13 +139,50 @@ def _goes_on(
         valid=valid,
     )
     ended = terminated | truncated
-    start = _draw_rows(episodes.starts, age.shape[0], key)
-    return Episodes(
-        env=select_rows(ended, _rows(episodes.starts, start), after),
-        age=jnp.where(ended, 0, age),
+    start, first_age = _draw_beginnings(episodes, age.shape[0], key)
+    return episodes._replace(
+        env=select_rows(ended, rows_of(episodes.starts, start), after),
+        age=jnp.where(ended, first_age, age),
         start=jnp.where(ended, start, episodes.start),
-        starts=episodes.starts,
     ), transition
+
+
+def _draw_beginnings(
+    episodes: Episodes, num: int, key: jax.Array
+) -> tuple[jax.Array, jax.Array | int]:
+    """Draws rows of the pool at which episodes begin [num], and their ages."""
+    if episodes.restarts is None:
+        return draw_rows(episodes.starts, num, key), 0
+    share, ages = episodes.restarts
+    key_which, key_start, key_restart = jax.random.split(key, 3)
+    restart = jax.random.randint(key_restart, (num,), 0, ages.shape[0])
+    start = draw_rows(only_starts(episodes), num, key_start)
+    again = jax.random.uniform(key_which, (num,)) < share
+    first = episodes.starts.done.shape[0] - ages.shape[0]
+    return jnp.where(again, first + restart, start), jnp.where(again, ages[restart], 0)
+
+
+def with_restarts(episodes: Episodes, states: State, restarts: Restarts) -> Episodes:
+    """Adds states [Q, ...] to the pool, at which a share of the episodes begins from now on."""
+    pool = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), only_starts(episodes), states)
+    return episodes._replace(starts=pool, restarts=restarts)
+
+
+def begin_again(episodes: Episodes, key: jax.Array) -> Episodes:
+    """Begins every episode anew."""
+    num = episodes.age.shape[0]
+    start, age = _draw_beginnings(episodes, num, key)
+    return episodes._replace(
+        env=rows_of(episodes.starts, start), start=start, age=jnp.broadcast_to(age, (num,))
+    )
+
+
+def only_starts(episodes: Episodes) -> State:
+    """Returns the pool without restarts, [R, ...]."""
+    if episodes.restarts is None:
+        return episodes.starts
+    num = episodes.starts.done.shape[0] - episodes.restarts.age.shape[0]
+    return jax.tree.map(lambda x: x[:num], episodes.starts)
 
 
 def select_rows(mask: jax.Array, on_true: Tree, on_false: Tree) -> Tree:
@@ -137,11 +199,3 @@ def finite_rows(state: State) -> jax.Array:
     rows = state.done.shape[0]
     floats = [x for x in jax.tree.leaves(state) if jnp.issubdtype(x.dtype, jnp.floating)]
     return jnp.stack([jnp.isfinite(x).reshape(rows, -1).all(-1) for x in floats]).all(0)
-
-
-def _draw_rows(starts: State, num: int, key: jax.Array) -> jax.Array:
-    return jax.random.randint(key, (num,), 0, starts.done.shape[0])
-
-
-def _rows(states: State, rows: jax.Array) -> State:
-    return jax.tree.map(lambda x: x[rows], states)

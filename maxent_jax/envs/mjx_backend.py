@@ -37,10 +37,7 @@ def make(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...], imp
                 "install it, or choose mjx or mujoco"
             )
         importlib.import_module("warp").config.quiet = True  # it reports each kernel it compiles
-    model = copy.copy(model)
-    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # MJX never resets
-    if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:  # MJX has no PGS
-        model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    model = _for_mjx(model)
     device_model, blank = _put(model, impl, needs_forces="cfrc_ext" in derived)
 
     def single(state: PhysicsState, control: jax.Array) -> tuple[PhysicsState, Derived]:
@@ -57,6 +54,31 @@ def make(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...], imp
             return _batched(single, control.ndim - 1)(state, control)
 
     return Physics(step, _derive(model, derived))
+
+
+def center_of_mass(model: mujoco.MjModel) -> Callable[[jax.Array], jax.Array]:
+    """Returns the map from positions to the centre of mass: qpos [..., nq] -> [..., 3] metres."""
+    device_model = mjx.put_model(_for_mjx(model), impl="jax")
+    blank = mjx.make_data(device_model, impl="jax")
+    share = jnp.asarray(model.body_mass / model.body_mass.sum(), jnp.float32)
+
+    def single(qpos: jax.Array) -> jax.Array:
+        return share @ mjx.kinematics(device_model, blank.replace(qpos=qpos)).xipos
+
+    def of_positions(qpos: jax.Array) -> jax.Array:
+        with jax.numpy_rank_promotion("allow"):  # MJX promotes ranks
+            return _batched(single, qpos.ndim - 1)(qpos)
+
+    return of_positions
+
+
+def _for_mjx(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy of the model with options that MJX has."""
+    model = copy.copy(model)
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # MJX never resets
+    if model.opt.solver == mujoco.mjtSolver.mjSOL_PGS:  # MJX has no PGS
+        model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    return model
 
 
 def _put(model: mujoco.MjModel, impl: str, needs_forces: bool) -> tuple[mjx.Model, mjx.Data]:

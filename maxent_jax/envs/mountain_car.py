@@ -32,6 +32,11 @@ GRID = Grid(
 )
 
 
+def reached(observation: jax.Array) -> jax.Array:
+    """Returns whether the car is at its goal, [..., 2] -> [...] bool."""
+    return (observation[..., 0] >= GOAL) & (observation[..., 1] >= 0)
+
+
 class MountainCar(Env):
     """A brax environment; its pipeline state is the observation."""
 
@@ -58,8 +63,8 @@ class MountainCar(Env):
         position = jnp.clip(position + velocity, *POSITION)
         velocity = jnp.where((position == POSITION[0]) & (velocity < 0), 0.0, velocity)
         after = jnp.stack([position, velocity])
-        reached = (position >= GOAL) & (velocity >= 0)
-        return state.replace(pipeline_state=after, obs=after, done=reached.astype(jnp.float32))
+        done = reached(after).astype(jnp.float32)
+        return state.replace(pipeline_state=after, obs=after, done=done)
 
     @property
     def observation_size(self) -> int:

@@ -103,7 +103,7 @@ class MujocoEnv(Env):
         Raises:
           ValueError: the action has the wrong size.
         """
-        control = self._control(action)
+        control = self.control(action)
         return self._reached(state, *self._physics.step(state.pipeline_state, control))
 
     @in_32_bits
@@ -127,13 +127,19 @@ class MujocoEnv(Env):
         if self._physics.step_beside is None:
             result, _ = work(key)
             return jax.vmap(self.step)(state, action), result
-        control = jax.vmap(self._control)(action)
+        control = jax.vmap(self.control)(action)
         reached, result = self._physics.step_beside(state.pipeline_state, control, work, key)
         return jax.vmap(self._reached)(state, *reached), result
 
-    def _control(self, action: jax.Array) -> jax.Array:
-        action = check_action(self, action)
-        return self._control_center + self._control_span * jnp.clip(action, -1, 1)
+    def control(self, action: jax.Array) -> jax.Array:
+        """Returns the controls of actions, [..., A] in [-1, 1] -> [..., A] in the model's units.
+
+        Raises:
+          ValueError: the action has the wrong size.
+        """
+        action = jnp.clip(check_action(self, action), -1, 1)
+        center, span = jnp.broadcast_arrays(self._control_center, self._control_span, action)[:2]
+        return center + span * action
 
     def _reached(self, state: State, after: PhysicsState, derived: Derived) -> State:
         observation = self.task.observe(after, derived)

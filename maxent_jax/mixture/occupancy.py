@@ -27,6 +27,7 @@ class Occupancy(NamedTuple):
     alive: jax.Array  # [R] bool: reached before the episode's end
     episode_policy: jax.Array  # [E] int32
     num_invalid: jax.Array  # [] int32
+    task_return: jax.Array | None = None  # [E] of each episode, undiscounted; None without a task
 
 
 class Scores(NamedTuple):
@@ -66,7 +67,8 @@ def of_mixture(
         act = _act_by_any(components, archive, weights, deterministic)
         reached = _play(components, act, starts, key_act)
         nobody = jnp.zeros(num_episodes, jnp.int32)
-        return of_episodes(components, weights, nobody, *_visited(reached), alike=True)
+        found = of_episodes(components, weights, nobody, *_visited(reached), alike=True)
+        return found._replace(task_return=task_returns(components, starts, reached))
     if components.config.mixture.pooled:
         plays, offset = weights, jax.random.uniform(key_assign)
     else:
@@ -76,7 +78,8 @@ def of_mixture(
     episode_policy = mixture.assign_episodes(plays, num_episodes, offset)
     reached = play(components, archive, episode_policy, starts, key_act, deterministic)
     pooled = components.config.mixture.pooled
-    return of_episodes(components, weights, episode_policy, *_visited(reached), alike=pooled)
+    found = of_episodes(components, weights, episode_policy, *_visited(reached), alike=pooled)
+    return found._replace(task_return=task_returns(components, starts, reached))
 
 
 def corrected(
@@ -143,6 +146,15 @@ def of_episodes(
         episode_policy=episode_policy,
         num_invalid=num_invalid,
     )
+
+
+def task_returns(components: Components, starts: State, reached: Trajectories) -> jax.Array | None:
+    """Returns what the task pays for each episode from `starts` [E, ...], undiscounted, [E]."""
+    if components.task is None:
+        return None
+    before = jnp.concatenate([starts.obs[None], reached.states[:-1]])
+    paid = components.task.reward(before, reached.actions, reached.states)
+    return jnp.sum(jnp.where(reached.alive, paid, 0.0), axis=0)
 
 
 def play(
@@ -265,4 +277,15 @@ def measures(components: Components, occupancy: Occupancy, key: jax.Array) -> Me
             sample, config.intrinsic.num_neighbors, labels=rows
         ),
         "evaluation_episode_length": jnp.sum(occupancy.alive) / occupancy.episode_policy.shape[0],
+        **_task_measures(components, occupancy),
     }
+
+
+def _task_measures(components: Components, occupancy: Occupancy) -> Metrics:
+    """The task's mean return over the episodes, and the share of successes if it is sparse."""
+    if components.task is None or occupancy.task_return is None:
+        return {}
+    found = {"task_return": jnp.mean(occupancy.task_return)}
+    if components.task.sparse:
+        found["task_success"] = jnp.mean(occupancy.task_return > 0)
+    return found

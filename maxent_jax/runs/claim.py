@@ -103,7 +103,7 @@ def _is_of_a_beginning(path: Path) -> bool:
     temporary = {
         files.temporary_of(directory / name).name for name in (files.CONFIG, files.METRICS)
     }
-    if path.name in LOGGERS:
+    if path.name in (*LOGGERS, files.FIRST):
         return (directory / files.CONFIG).is_file()
     return path.name in {locks.LOCK, *temporary}
 

@@ -10,10 +10,10 @@ import jax
 import numpy as np
 
 from maxent_jax import algorithm, components, native
-from maxent_jax.algorithm import Programs, State, devices, methods
+from maxent_jax.algorithm import Programs, State, devices, finetune, methods
 from maxent_jax.config import Config
 from maxent_jax.errors import UsageError
-from maxent_jax.runs import checkpoint, files, hosts, integrity, memory, runtime
+from maxent_jax.runs import checkpoint, files, hosts, integrity, memory, runtime, source
 from maxent_jax.runs.checkpoint import Progress
 from maxent_jax.runs.clock import Clock
 from maxent_jax.runs.loggers import Sinks
@@ -106,8 +106,20 @@ def _fresh(config: Config, directory: Path, placed: State | None) -> Stage:
         files.write_metrics(directory, [])
 
     hosts.first_alone(write, "config")
-    state = algorithm.start(config) if placed is None else devices.start(config, placed)
+    if config.downstream.source:
+        state = _from_source(config, directory, placed)
+    else:
+        state = algorithm.start(config) if placed is None else devices.start(config, placed)
     return Stage(state, Progress([], None, [], {}))
+
+
+def _from_source(config: Config, directory: Path, placed: State | None) -> State:
+    """The first state of a run that starts from another; writes what its first episodes found."""
+    archive, name = source.load(config)
+    state, first = finetune.start(config, archive)
+    found = {"source": config.downstream.source, "checkpoint": name} | first._asdict()
+    hosts.first_alone(lambda: files.write_json(directory / files.FIRST, found), "first episodes")
+    return state if placed is None else jax.device_put(state, placed)
 
 
 def _method_in_words(config: Config) -> dict[str, Any]:

@@ -20,9 +20,10 @@ READABLE = (4, 5, 6, 7)  # schemas with the same arrays for policies and visits
 RESUMABLE = (6, 7)  # schemas with the same arrays for the whole state
 REMOVED = {"restart_actor": False}  # settings of older schemas, with the value now fixed
 CONFIG, METRICS, FIGURES = "config.json", "metrics.jsonl", "figures"
+FIRST = "first_episodes.json"  # of a run that starts from another
 # All that any command writes there.
 WRITTEN = (
-    *(CONFIG, METRICS, FIGURES, "checkpoints", "evaluation.json"),
+    *(CONFIG, METRICS, FIRST, FIGURES, "checkpoints", "evaluation.json"),
     *("videos", "report.html", "tensorboard", "wandb"),
 )
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint")

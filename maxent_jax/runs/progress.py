@@ -1,8 +1,9 @@
 """Progress on standard error: a bar in a terminal, otherwise one line per iteration."""
 
+import contextlib
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -64,6 +65,26 @@ def track(items: Sequence[Item], what: str) -> Iterable[Item]:
     """Returns the items, with a progress line on standard error if that is a terminal."""
     console = Console(stderr=True)
     return progress.track(items, what, console=console, disable=not console.is_terminal)
+
+
+@contextlib.contextmanager
+def counting(total: int, what: str) -> Iterator[Callable[[int], None]]:
+    """Context manager: gives a function that shows how many of the total are done.
+
+    It draws a bar in a terminal, otherwise it prints a line at each tenth of the total.
+    """
+    console, tenths = Console(stderr=True), 0
+    with Progress(console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(what, total=total)
+
+        def report(done: int) -> None:
+            nonlocal tenths
+            bar.update(task, completed=done)
+            if not console.is_terminal and 10 * done // total > tenths:
+                tenths = 10 * done // total
+                say(f"{done:,} of {total:,} {what}")
+
+        yield report
 
 
 class Bar:
@@ -178,8 +199,13 @@ def _together(*parts: str) -> str:
 
 
 def _reached(row: dict[str, Any]) -> list[str]:
-    """Coverage and entropy, averaged over seeds."""
+    """Coverage and entropy, or the task's return and successes, averaged over seeds."""
     if not row:
         return []
+    if "task_return" in row:
+        reached = [f"return {np.mean(row['task_return']):,.1f}"]
+        if "task_success" in row:
+            reached.append(f"{np.mean(row['task_success']):.0%} successes")
+        return reached
     coverage = np.mean(row["cumulative_coverage"])
     return [f"{coverage:,.0f} cells", f"{np.mean(row['cumulative_entropy']):.2f} nats"]

@@ -155,8 +155,24 @@ def value(sac: Sac, parameters: Parameters, observation: jax.Array, key: jax.Arr
     return jnp.min(values, axis=-1) - jnp.exp(parameters.log_temperature) * surprise
 
 
-def update(sac: Sac, agent: Agent, batch: losses.Batch, key: jax.Array) -> tuple[Agent, Metrics]:
-    """Takes one gradient step of critics, actor and temperature, then moves the target critics."""
+def update(
+    sac: Sac,
+    agent: Agent,
+    batch: losses.Batch,
+    key: jax.Array,
+    only_critics: jax.Array | None = None,
+) -> tuple[Agent, Metrics]:
+    """Takes one gradient step of critics, actor and temperature, then moves the target critics.
+
+    Args:
+      sac: the static part.
+      agent: the learner.
+      batch: [B] transitions.
+      key: of the actions drawn.
+      only_critics: [] bool, whether actor and temperature stay as they are; None: they never do.
+    Returns:
+      The learner after the step, and metrics.
+    """
     key_next, key_actor = jax.random.split(key)
     parameters = agent.parameters
     inputs = _inputs(sac, parameters.moments, batch.observation)
@@ -182,6 +198,9 @@ def update(sac: Sac, agent: Agent, batch: losses.Batch, key: jax.Array) -> tuple
 
     gradients = (actor_gradient, critic_gradient, temperature_gradient)
     steps, optimizer = sac.optimizer.update(gradients, agent.optimizer)
+    if only_critics is not None:
+        moves = lambda tree: jax.tree.map(lambda x: jnp.where(only_critics, 0.0, x), tree)
+        steps = (moves(steps[0]), steps[1], moves(steps[2]))
     actor, critic, log_temperature = optax.apply_updates(_learned(parameters), steps)
     target_critic = optax.incremental_update(critic, parameters.target_critic, sac.soft_update_rate)
     metrics = {

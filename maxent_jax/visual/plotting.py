@@ -13,6 +13,7 @@ from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 
 from maxent_jax.analysis import Paths, Run
+from maxent_jax.config import tasks
 from maxent_jax.density import histogram
 from maxent_jax.density.histogram import Grid
 from maxent_jax.runs.files import FIGURES, whole_file
@@ -32,9 +33,9 @@ AGENT, MIXTURE, RANDOM = "#1b6ca8", "#d1495b", "#7a7a7a"
 
 
 def curves(run: Run) -> Figure:
-    """Draws coverage and entropy against iterations, env steps and wall-clock time."""
-    figure = Figure(figsize=(11, 6.4), layout="constrained")
-    axes = _axes_of_curves(figure, f"visited cells, of {run.components.grid.num_cells:,}")
+    """Draws coverage, entropy and the task's return over iterations, env steps and time."""
+    figure, axes = _axes_of_curves([run], f"visited cells, of {run.components.grid.num_cells:,}")
+    _draw_task(axes, run, "-s", color=MIXTURE, ms=4)
     for prefix, name, color, style in (
         ("cumulative", "training, all states so far", AGENT, "-o"),
         ("mixture", "rollouts of the mixture", MIXTURE, "-s"),
@@ -52,14 +53,16 @@ def comparison(seeds: Mapping[str, Sequence[Run]]) -> Figure:
     Args:
       seeds: the seeds of each run, by the run's name in the legend.
     """
-    figure = Figure(figsize=(11, 6.8), layout="constrained")
-    axes = _axes_of_curves(figure, "visited cells")
+    every = list(itertools.chain(*seeds.values()))
+    figure, axes = _axes_of_curves(every, "visited cells")
     styles = [Line2D([], [], color="black", ls=style, label=label) for _, label, style in COMPARED]
     colors = []
     for i, (name, runs) in enumerate(seeds.items()):
         color = f"C{i % 10}"
         for run, (prefix, _, style) in itertools.product(runs, COMPARED):
             _draw_curves(axes, run, prefix, color=color, ls=style, marker=".", lw=1.2, ms=4)
+        for run in runs:
+            _draw_task(axes, run, color=color, ls="--", marker=".", lw=1.2, ms=4)
         colors.append(Line2D([], [], color=color, lw=4, label=name))
     _start_at_zero(axes)
     axes[1, 0].legend(handles=styles, frameon=False, fontsize=9, loc="lower right")
@@ -69,33 +72,48 @@ def comparison(seeds: Mapping[str, Sequence[Run]]) -> Figure:
     return figure
 
 
-def _axes_of_curves(figure: Figure, coverage_label: str) -> np.ndarray:
-    """[2, 3]: coverage and entropy, against each of the three axes."""
-    axes = figure.subplots(2, 3, sharey="row")
+def _axes_of_curves(runs: Sequence[Run], coverage_label: str) -> tuple[Figure, np.ndarray]:
+    """[2 or 3, 3]: coverage, entropy and the return of the runs' task, against each axis."""
+    labels = [coverage_label, "histogram entropy (nats)"]
+    named = {run.config.downstream.task for run in runs if "task_return" in run.metrics}
+    if named:
+        labels.append(f"return of {', '.join(sorted(named))}, per episode")
+    figure = Figure(figsize=(11, 3.2 * len(labels) + 0.2), layout="constrained")
+    axes = figure.subplots(len(labels), 3, sharey="row")
     for column, (_, label) in enumerate(COVERAGE_AXES):
         for ax in axes[:, column]:
             ax.set_xlabel(label)
             ax.grid(alpha=0.25)
-    for ax, label in zip(axes[:, 0], (coverage_label, "histogram entropy (nats)"), strict=True):
+    for ax, label in zip(axes[:, 0], labels, strict=True):
         ax.set_ylabel(label)
-    return axes
+    return figure, axes
 
 
 def _start_at_zero(axes: np.ndarray) -> None:
     """Call when all is drawn: it ends the automatic choice of the upper limit."""
-    for ax in axes[:, 0]:
+    for ax in axes[:2, 0]:
         ax.set_ylim(bottom=0)
 
 
 def _draw_curves(axes: np.ndarray, run: Run, prefix: str, *style: str, **options: Any) -> None:
     """Draws one line in each of the axes, none for what the run did not measure."""
-    for quantity, row in zip(("coverage", "entropy"), axes, strict=True):
-        values = run.metrics.get(f"{prefix}_{quantity}")
-        if values is None:
-            continue
-        for (axis, _), ax in zip(COVERAGE_AXES, row, strict=True):
-            x = run.metrics[axis] / (1000 if axis == "env_steps" else 1)
-            ax.plot(x, values, *style, **options)
+    for quantity, row in zip(("coverage", "entropy"), axes, strict=False):
+        _draw_metric(row, run, f"{prefix}_{quantity}", *style, **options)
+
+
+def _draw_task(axes: np.ndarray, run: Run, *style: str, **options: Any) -> None:
+    if "task_return" in run.metrics:
+        _draw_metric(axes[2], run, "task_return", *style, **options)
+
+
+def _draw_metric(row: np.ndarray, run: Run, name: str, *style: str, **options: Any) -> None:
+    """Draws a metric in each panel of a row, nothing if the run did not measure it."""
+    values = run.metrics.get(name)
+    if values is None:
+        return
+    for (axis, _), ax in zip(COVERAGE_AXES, row, strict=True):
+        x = run.metrics[axis] / (1000 if axis == "env_steps" else 1)
+        ax.plot(x, values, *style, **options)
 
 
 def occupancy_map(run: Run, mixture_cells: np.ndarray) -> Figure:
@@ -210,7 +228,9 @@ def _name_axes(ax: Axes, run: Run) -> None:
 def _finish(figure: Figure, run: Run) -> Figure:
     """Adds a title and, below, every departure from the paper by name."""
     config = run.config
-    figure.suptitle(f"{config.title}, {config.env}, preset {config.preset}, seed {run.seed}")
+    task = config.downstream.task
+    paid = "" if task == tasks.NONE else f", task {task}"
+    figure.suptitle(f"{config.title}, {config.env}{paid}, preset {config.preset}, seed {run.seed}")
     named = ", ".join(f"{name}={config[name]}" for name in config.deviations())
     figure.supxlabel(f"departs from the paper in: {named or 'nothing'}", fontsize=6, wrap=True)
     return figure

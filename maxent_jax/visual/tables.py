@@ -22,6 +22,8 @@ METRICS = (  # name, head, format
     ("cumulative_entropy", "entropy, training", ".2f"),
     ("random_entropy", "entropy, random", ".2f"),
     ("mixture_entropy", "entropy, mixture", ".2f"),
+    ("task_return", "return of the task", ",.2f"),
+    ("task_success", "successes", ".0%"),
 )
 SECONDS = (
     ("wall_begin", "of rollouts for the reward", np.sum),
@@ -67,6 +69,7 @@ def headline(seeds: Sequence[Run]) -> dict[str, Any]:
         ("cells, mixture", "mixture_coverage", ",.0f", cells),
         ("entropy, training", "cumulative_entropy", ".2f", "nats"),
         ("entropy, mixture", "mixture_entropy", ".2f", "nats"),
+        ("return of the task", "task_return", ",.1f", "per episode"),
         ("env steps", "env_steps", ",.0f", "per seed" if len(seeds) > 1 else "of training"),
         ("wall-clock time", "wall_seconds", ",.0f", "seconds"),
     )
@@ -75,6 +78,7 @@ def headline(seeds: Sequence[Run]) -> dict[str, Any]:
         "tiles": [
             {"what": what, "value": number(_mean_last(seeds, name), how), "beside": beside}
             for what, name, how, beside in tiles
+            if not name.startswith("task_") or name in first.metrics
         ],
     }
 
@@ -86,19 +90,25 @@ def _mean_last(seeds: Sequence[Run], name: str) -> float | None:
 
 def results(seeds: Mapping[str, Sequence[Run]]) -> Table:
     """Makes one row for each run and seed, after its last complete iteration."""
+    every = [run for of_run in seeds.values() for run in of_run]
+    measured = [
+        metric
+        for metric in METRICS
+        if not metric[0].startswith("task_") or any(metric[0] in run.metrics for run in every)
+    ]
     rows = [
         [
             name,
             f"{run.config.title}, {run.config.env}, {run.config.preset}",
             str(run.seed),
             f"{len(run.metrics.get('iteration', ()))} of {run.config.budget.num_iterations}",
-            *(number(last(run, metric), how) for metric, _, how in METRICS),
+            *(number(last(run, metric), how) for metric, _, how in measured),
         ]
         for name, of_run in seeds.items()
         for run in of_run
     ]
     head = ["run", "method, environment, preset", "seed", "iterations"]
-    return Table([*head, *(text for _, text, _ in METRICS)], rows)
+    return Table([*head, *(text for _, text, _ in measured)], rows)
 
 
 def iterations(run: Run) -> Table:
@@ -141,8 +151,15 @@ def measures(measured: Mapping[str, float]) -> Table:
         ("mixture_knn_entropy", "entropy of the features (nats)", ".2f"),
         ("mixture_off_grid_share", "share of states off the grid", ".1%"),
         ("evaluation_episode_length", "steps per episode", ",.0f"),
+        ("task_return", "return of the task per episode", ",.2f"),
+        ("task_success", "episodes with a success", ".0%"),
     )
-    return Table([], [[what, number(measured.get(name), how)] for name, what, how in named])
+    rows = [
+        [what, number(measured.get(name), how)]
+        for name, what, how in named
+        if not name.startswith("task_") or name in measured
+    ]
+    return Table([], rows)
 
 
 def budget(run: Run, planned: Any) -> Table:

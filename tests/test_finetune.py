@@ -1,0 +1,270 @@
+"""Runs on a task that start from the policies of another run."""
+
+import json
+import shutil
+import time
+
+import commands
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import user_module  # noqa: F401  registers user:point and user:right
+from test_checkpoint import StopAt, restored, timeless
+
+import maxent_jax
+from maxent_jax import algorithm, components, mixture
+from maxent_jax.algorithm import experience, finetune, training
+from maxent_jax.config import preset
+from maxent_jax.runs import driver, files, source
+from maxent_jax.runs.signals import Interrupted
+from maxent_jax.sac import agent
+from maxent_jax.types import Distances, Outcomes
+
+STARTS = ("scratch", "last", "best", "mixture", "both")
+
+
+def task_config(**changes):
+    """A run on the task `user:right`: the point is paid for its first coordinate."""
+    settings = {"env": "user:point", "method": "task", "task": "user:right", "source": "there"}
+    return preset("smoke", **{**settings, **changes})
+
+
+def biased(config, key, bias):
+    """Parameters whose actions are those of `tanh(bias)` with little noise, in each dimension."""
+    p = components.make(config)
+    parameters = agent.init(p.sac, key).parameters
+    size = p.sac.action_size
+    actor = jax.tree.map(jnp.zeros_like, parameters.actor)
+    output = actor["params"]["Dense_0"]
+    output["bias"] = jnp.concatenate([jnp.full(size, bias), jnp.full(size, -4.0)])
+    return parameters._replace(actor=actor)
+
+
+def archive_of(config, biases):
+    keys = jax.random.split(jax.random.key(1), len(biases))
+    made = [biased(config, key, bias) for key, bias in zip(keys, biases, strict=True)]
+    archive = mixture.init(made[0], len(made) + 2)  # with empty slots, as of an unfinished run
+    for parameters in made:
+        archive = mixture.append(archive, parameters)
+    return archive
+
+
+def equal(one, other):
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    return all(np.array_equal(x, y) for x, y in pairs)
+
+
+@pytest.mark.parametrize("start_from", STARTS)
+def test_the_agent_is_the_one_that_the_start_names(start_from):
+    config = task_config(start_from=start_from, first_episodes=2)
+    archive = archive_of(config, [-0.1, 0.1, -0.05])
+    state, first = finetune.start(config, archive)
+    expected = {"scratch": -1, "last": 2, "best": 1, "mixture": -1, "both": 1}[start_from]
+    assert int(first.policy) == expected
+    if expected < 0:
+        fresh = algorithm.start(config).learner.agent.parameters
+        assert equal(state.learner.agent.parameters, fresh)
+    else:
+        chosen = mixture.policy(archive, jnp.asarray(expected))
+        assert equal(state.learner.agent.parameters, chosen)
+        assert equal(mixture.policy(state.archive, jnp.asarray(0)), chosen)
+    assert int(state.archive.size) == 1
+    played = start_from in ("best", "mixture", "both")
+    assert (int(first.num_steps) > 0) == played == bool(np.isfinite(first.task_return).all())
+    assert int(state.learner.first_steps) == int(first.num_steps)
+    filled = start_from in ("mixture", "both")
+    assert int(state.learner.replay.size) == (int(first.num_steps) if filled else 0)
+
+
+def test_returns_are_those_of_the_task():
+    config = task_config(start_from="best", first_episodes=4)
+    _, first = finetune.start(config, archive_of(config, [0.0, 0.1]))
+    # An action a moves the point by 0.2 a a step, until it leaves the circle of radius 2.
+    along = 0.2 * np.tanh(0.1) * np.arange(1, 101)
+    num_steps = np.argmax(2 * along**2 > 4.0) + 1
+    np.testing.assert_allclose(first.task_return[1], along[:num_steps].sum(), rtol=0.15)
+    assert abs(first.task_return[0]) < 0.2 * first.task_return[1]
+
+
+def test_the_replay_holds_the_first_episodes():
+    config = task_config(start_from="mixture", first_episodes=3, replay_size=4_000)
+    state, first = finetune.start(config, archive_of(config, [0.02, -0.03, 0.01]))
+    ring, starts = state.learner.replay, np.asarray(state.learner.episodes.starts.obs)
+    items = jax.tree.map(lambda x: np.asarray(x[: int(ring.size)]), ring.items)
+    begins = items.previous < 0
+    assert begins.sum() == 9  # in 3 rounds, for there are 4 environments
+    left = np.where(
+        begins[:, None], starts[np.maximum(-1 - items.previous, 0)], items.state[items.previous]
+    )
+    np.testing.assert_allclose(items.state, left + 0.2 * items.action, atol=1e-6)
+    np.testing.assert_array_equal(items.task[:, 0], items.state[:, 0])
+    goes_on = items.following >= 0
+    assert (items.previous[items.following[goes_on]] == np.flatnonzero(goes_on)).all()
+    assert goes_on.sum() == len(begins) - begins.sum()
+    assert int(first.num_steps) == len(begins)
+    assert int(state.learner.visits.cells.sum() + state.learner.visits.off_grid) == len(begins)
+
+
+def test_copies_are_paid_at_the_states_to_which_they_are_turned():
+    config = preset(
+        "smoke", env="ant", method="task", task="run:20", yaw_copies=2, policy_inputs="heading"
+    )
+    state = algorithm.start(config)
+    state, _ = jax.jit(lambda s: algorithm.train_segment(config, s))(
+        jax.jit(lambda s: algorithm.begin(config, s))(state)[0]
+    )
+    p, learner = components.make(config), state.learner
+    drawn = experience.sample(
+        p, learner.replay, learner.episodes.starts.obs, (64,), jax.random.key(3)
+    )
+    # Of one step: the state drawn is the one left, turned like the state reached.
+    expected = p.task.reward(drawn.observation, drawn.action, drawn.next_observation)
+    np.testing.assert_allclose(drawn.outcomes.task[:, 0], expected, atol=1e-3)
+    assert learner.replay.items.task.shape[1] == 3
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        (dict(intrinsic_weight=0.0), 6.0),
+        (dict(), 6.0 + 5.0),
+        (dict(intrinsic_weight=0.5), 6.0 + 2.5),
+        (dict(intrinsic_decay=400), 6.0 + 0.75 * 5.0),
+        (dict(intrinsic_decay=50), 6.0),
+    ],
+)
+def test_beta_weighs_the_intrinsic_reward_and_falls(changes, expected):
+    config = task_config(**{"method": "v", "task_scale": 2.0, **changes})
+    p = components.make(config)
+    learner = algorithm.start(config).learner._replace(env_steps=jnp.asarray(100, jnp.int32))
+    number = jnp.full((1, 1), 1.0)
+    outcomes = Outcomes(
+        features=number[..., None],
+        next_features=number[..., None],
+        bonus=number,
+        terminated=number < 0,
+        distances=Distances(number, number, number),
+        taken=number > 0,
+        task=3.0 * number,
+    )
+    found = training.with_task(p, learner, 5.0 * number, outcomes)
+    np.testing.assert_allclose(found, [[expected]], rtol=1e-6)
+
+
+def finetuned(run, out, *flags, expect=0):
+    return commands.call("finetune", run, "--out", out, *flags, expect=expect)
+
+
+@pytest.fixture(scope="module")
+def on_task(smoke_run, tmp_path_factory):
+    """The run of preset smoke on Ant, trained on a task."""
+    out = tmp_path_factory.mktemp("on_task") / "run"
+    finetuned(smoke_run, out, "--task", "goal:0,0", "--num-iterations", "2")
+    return out
+
+
+def test_a_run_on_a_task_is_a_run_with_a_return(smoke_run, on_task):
+    run = maxent_jax.load_run(on_task)
+    first = json.loads((on_task / files.FIRST).read_text())
+    assert first["source"] == str(smoke_run)
+    assert len(first["task_return"]) == maxent_jax.load_run(smoke_run).num_policies
+    assert first["policy"] == int(np.argmax(first["task_return"]))
+    np.testing.assert_array_equal(
+        run.metrics["env_steps"], first["num_steps"] + 400 * np.array([1, 2])
+    )
+    # A start lies within the goal's radius of 2 m, and an untrained Ant hardly leaves it.
+    assert (run.metrics["task_success"] == 1).all()
+    assert (run.metrics["task_return"] > 1).all()
+    assert (run.metrics["task_step_reward"] > 0.5).all()
+    assert (on_task / "figures" / "curves.png").exists()
+    assert run.config.method == "task" and run.config.intrinsic.shaping == 0
+
+
+def test_reports_and_evaluations_name_the_task(on_task, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(on_task, copy)
+    assert "task_success" in commands.call("evaluate", copy, "--episodes", "1").stdout
+    commands.call("report", copy)
+    page = (copy / "report.html").read_text()
+    assert "return of the task" in page and "goal:0,0" in page
+
+
+def test_a_finished_run_is_left_alone_and_another_start_is_refused(smoke_run, on_task):
+    flags = ("--task", "goal:0,0", "--num-iterations", "2", "--resume")
+    assert "is complete" in finetuned(smoke_run, on_task, *flags).stdout
+    refused = finetuned(smoke_run, on_task, *flags, "--from", "best", expect=2)
+    assert "start_from was both and is best" in refused.stderr
+
+
+@pytest.mark.slow
+def test_a_stopped_run_ends_as_one_that_was_not(smoke_run, tmp_path, monkeypatch):
+    config = source.on_task(smoke_run, "run:0", start_from="both", intrinsic_weight=0.1)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    for directory in (whole, broken):
+        directory.mkdir()
+    driver.train(config, whole, time.perf_counter())
+    for boundary in (1, 2):  # begun; the iteration's end
+        monkeypatch.setattr(driver, "Interruption", lambda n=boundary: StopAt(n))
+        with pytest.raises(Interrupted):
+            driver.train(config, broken, time.perf_counter())
+    monkeypatch.undo()
+    driver.train(config, broken, time.perf_counter())
+    assert timeless(broken) == timeless(whole)
+    assert equal(restored(broken), restored(whole))
+
+
+def test_seeds_side_by_side_start_from_one_archive():
+    config = task_config(start_from="both", num_seeds=2)
+    archive = archive_of(config, [0.1, -0.1])
+    state, first = finetune.start(config, archive)
+    assert not np.array_equal(*first.task_return)
+    _, alone = finetune.start(config.replace(num_seeds=1), archive)
+    np.testing.assert_allclose(first.task_return[0], alone.task_return, rtol=1e-4)
+    shapes = jax.eval_shape(lambda: algorithm.start(config))
+    assert jax.tree.map(jnp.shape, state) == jax.tree.map(jnp.shape, shapes)
+
+
+def test_a_seed_of_several_can_be_chosen(two_seeds):
+    archives = [
+        source.load(source.on_task(two_seeds, "forward", source_seed=i))[0] for i in range(2)
+    ]
+    for i, archive in enumerate(archives):
+        assert equal(archive.parameters, maxent_jax.load_run(two_seeds, i).mixture.parameters)
+
+
+@pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        ((), "the task is missing: add --task, one of gymnasium, forward, "),
+        (("--task", "flip"), "task is flip, but ant has only: gymnasium, "),
+        (("--task", "user:nobody"), "task 'user:nobody' is not registered"),
+        (("--task", "stand", "--from", "top"), "unknown start-from 'top'"),
+        (("--task", "stand", "--first-episodes", "0"), "first-episodes is 0, but must be at least"),
+        (("--task", "stand", "--hidden-size", "64"), "hidden-size is 64, but must be 32, as in "),
+        (("--task", "stand", "--source-seed", "1"), "source-seed is 1, but must be below 1"),
+        (("--task", "stand", "--intrinsic-decay", "9"), "but intrinsic-weight is 0: leave one out"),
+    ],
+)
+def test_bad_input_gives_one_sentence(smoke_run, tmp_path, flags, sentence):
+    done = finetuned(smoke_run, tmp_path / "out", *flags, expect=2)
+    assert sentence in done.stderr and done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_directory_without_a_run_gives_one_sentence(tmp_path):
+    done = commands.call("finetune", tmp_path, "--task", "stand", expect=2)
+    assert "is not the directory of a run" in done.stderr
+    assert "name it first" in commands.call("finetune", "--task", "stand", expect=2).stderr
+
+
+@pytest.mark.parametrize(
+    ("flags", "sentence"),
+    [
+        (("--method", "task"), "method is task, but task is none: name a task."),
+        (("--start-from", "last"), "but there is no source: name the directory of a run."),
+        (("--intrinsic-weight", "0"), "intrinsic-weight is 0, but task is none: name a task."),
+    ],
+)
+def test_train_refuses_a_task_without_a_name(flags, sentence):
+    assert sentence in commands.call("train", "--preset", "smoke", *flags, expect=2).stderr
