@@ -107,9 +107,8 @@ def test_a_stored_step_is_one_of_gymnasiums(minari_dataset):
             raw.set_state(before[:15], before[15:])
             raw.data.qacc_warmstart[:] = 0.0
             gaps.append(np.abs(env.step(action)[0] - after).max())
-    # States are stored in 32 bits, and without the solver's warm start: where feet touch down,
-    # velocities of up to 10 rad/s differ in the fourth digit.
-    assert np.median(gaps) < 1e-4
+    # Rounding states to 32 bits and leaving out the solver's warm start cost about 1e-6.
+    assert max(gaps) < 1e-4
 
 
 def test_a_dataset_that_was_stopped_goes_on(run, written, tmp_path):

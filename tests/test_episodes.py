@@ -169,3 +169,34 @@ def test_rows_are_selected_in_trees_of_any_rank():
         assert rows.dtype == ones[name].dtype
         flat = np.asarray(rows).reshape(3, -1)
         np.testing.assert_array_equal(flat, np.broadcast_to([[1], [0], [1]], flat.shape))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_a_share_of_the_episodes_begins_within_earlier_ones(share, key):
+    many, ages = 400, jnp.arange(1, 9, dtype=jnp.int32)
+    episodes = base.init(LINE, many, 64, key)
+    within = jax.vmap(LINE.reset)(jax.random.split(key, 8))
+    within = within.replace(obs=within.obs + 2.0, pipeline_state=ages.astype(jnp.float32))
+    episodes = base.with_restarts(episodes, within, base.Restarts(jnp.asarray(share), ages))
+    assert base.only_starts(episodes).done.shape == (64,)
+    for begun in (
+        base.begin_again(episodes, key),
+        step(episodes, act(*[EDGE] * many), key, limit=100)[0],  # all die
+    ):
+        again = np.asarray(begun.start) >= 64
+        # 400 draws: a standard deviation of 0.025 at one half.
+        assert abs(again.mean() - share) < 0.125
+        assert (np.asarray(begun.env.obs[:, 0] >= 2.0) == again).all()
+        np.testing.assert_array_equal(begun.age, begun.env.pipeline_state)
+        np.testing.assert_array_equal(begun.env.obs, begun.starts.obs[begun.start])
+        if share:
+            assert set(np.unique(begun.age[again])) == set(range(1, 9))
+
+
+def test_other_restarts_take_the_place_of_the_first(episodes, key):
+    states = base.draw_starts(episodes.starts, 4, key)
+    restarts = base.Restarts(jnp.zeros(()), jnp.zeros(4, jnp.int32))
+    for _ in range(2):
+        episodes = base.with_restarts(episodes, states, restarts)
+        assert episodes.starts.done.shape == (68,)
+    assert len(np.unique(base.only_starts(episodes).obs)) == 64

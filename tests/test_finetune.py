@@ -67,8 +67,8 @@ def test_the_agent_is_the_one_that_the_start_names(start_from):
         assert equal(state.learner.agent.parameters, fresh)
     else:
         chosen = mixture.policy(archive, jnp.asarray(expected))
-        assert equal(state.learner.agent.parameters, chosen)
-        assert equal(mixture.policy(state.archive, jnp.asarray(0)), chosen)
+        assert equal(state.learner.agent.parameters.policy, chosen.policy)
+        assert equal(mixture.policy(state.archive, jnp.asarray(0)).policy, chosen.policy)
     assert int(state.archive.size) == 1
     played = start_from in ("best", "mixture", "both")
     assert (int(first.num_steps) > 0) == played == bool(np.isfinite(first.task_return).all())
@@ -104,6 +104,50 @@ def test_the_replay_holds_the_first_episodes():
     assert goes_on.sum() == len(begins) - begins.sum()
     assert int(first.num_steps) == len(begins)
     assert int(state.learner.visits.cells.sum() + state.learner.visits.off_grid) == len(begins)
+
+
+def test_restarts_are_states_of_successful_episodes():
+    config = task_config(task="user:beyond", start_from="both", restart_share=0.5)
+    state, first = finetune.start(config, archive_of(config, [-0.1, 0.1]))
+    assert first.task_return[0] == 0 and first.task_return[1] > 0
+    learner, episodes = state.learner, state.learner.episodes
+    num = training.NUM_RESTARTS
+    assert episodes.restarts.age.shape == (min(num, config.environment.num_starts),)
+    within = np.asarray(episodes.starts.obs[-episodes.restarts.age.shape[0] :])
+    # The successful policy moves right by 0.02 a step, from about 0.
+    np.testing.assert_allclose(within[:, 0], 0.02 * episodes.restarts.age, atol=0.5)
+    assert within[:, 0].max() > 1
+    again = np.asarray(episodes.start) >= config.environment.num_starts
+    assert ((np.asarray(episodes.age) > 0) == again).all()
+    np.testing.assert_array_equal(learner.place, -1 - episodes.start)
+    state, _ = jax.jit(lambda s: algorithm.begin(config, s))(state)
+    state, metrics = jax.jit(lambda s: algorithm.train_segment(config, s))(state)
+    assert np.isfinite(metrics["critic_loss"])
+
+
+def test_only_critics_learn_at_first():
+    config = task_config(start_from="last", critic_steps=200)  # a segment of two
+    state, _ = finetune.start(config, archive_of(config, [0.1]))
+    begun, _ = jax.jit(lambda s: algorithm.begin(config, s))(state)
+    before = begun.learner.agent.parameters
+    segment = jax.jit(lambda s: algorithm.train_segment(config, s))
+    once, _ = segment(begun)
+    after = once.learner.agent.parameters
+    assert equal(after.actor, before.actor) and after.log_temperature == before.log_temperature
+    assert not equal(after.critic, before.critic)
+    twice, _ = segment(once)
+    assert not equal(twice.learner.agent.parameters.actor, after.actor)
+
+
+def test_critics_are_new_unless_they_are_kept():
+    for restarts in (True, False):
+        config = task_config(start_from="last", restart_critics=restarts)
+        archive = archive_of(config, [0.1])
+        state, _ = finetune.start(config, archive)
+        held = mixture.policy(archive, jnp.asarray(0))
+        learner = state.learner.agent.parameters
+        assert equal(learner.critic, held.critic) == (not restarts)
+        assert equal(learner.critic, learner.target_critic) and equal(learner.actor, held.actor)
 
 
 def test_copies_are_paid_at_the_states_to_which_they_are_turned():
@@ -243,6 +287,10 @@ def test_a_seed_of_several_can_be_chosen(two_seeds):
         (("--task", "stand", "--first-episodes", "0"), "first-episodes is 0, but must be at least"),
         (("--task", "stand", "--hidden-size", "64"), "hidden-size is 64, but must be 32, as in "),
         (("--task", "stand", "--source-seed", "1"), "source-seed is 1, but must be below 1"),
+        (
+            ("--task", "stand", "--from", "last", "--restart-share", "0.1"),
+            "restart-share is 0.1, but must be 0 with start-from last",
+        ),
         (("--task", "stand", "--intrinsic-decay", "9"), "but intrinsic-weight is 0: leave one out"),
     ],
 )

@@ -52,3 +52,10 @@ envs.register(
 intrinsic.register("far", far_from_origin)
 register_method("newest", "last", 0, "mixture", "last", reward="linear")
 tasks.register("right", lambda observation, action, next_observation: next_observation[..., 0])
+tasks.register(
+    "beyond",
+    lambda observation, action, next_observation: (next_observation[..., 0] > 1).astype(
+        jnp.float32
+    ),
+    sparse=True,
+)

@@ -160,16 +160,21 @@ def _groups_side_by_side(x: jax.Array) -> jax.Array:
 
 
 def _restarting(p: Components, episodes: Episodes, found: _Episode, key: jax.Array) -> Episodes:
-    """Lets a share of the episodes begin at states of the best tenth of those that were found."""
+    """Lets a share of the episodes begin at states of the best tenth of those that were found.
+
+    An episode is drawn in proportion to how far its return is above the worst.
+    """
     key_episode, key_time, key_begin = jax.random.split(key, 3)
     num = min(training.NUM_RESTARTS, p.config.environment.num_starts)
-    _, best = jax.lax.top_k(found.task_return, -(-found.task_return.shape[0] // 10))
-    chosen = jax.random.choice(key_episode, best, (num,))
+    returns, best = jax.lax.top_k(found.task_return, -(-found.task_return.shape[0] // 10))
+    above = returns - jnp.min(found.task_return)  # so that of a sparse task only successes count
+    share = jnp.where(jnp.max(above) > 0, above, 1.0)
+    chosen = jax.random.choice(key_episode, best, (num,), p=share / jnp.sum(share))
     logits = jnp.where(found.goes_on[:, chosen], 0.0, -jnp.inf)
     time = jax.random.categorical(key_time, logits, axis=0)
     states = jax.tree.map(lambda x: x[time, chosen], found.env)
-    share = jnp.asarray(p.config.downstream.restart_share)
-    episodes = base.with_restarts(episodes, states, base.Restarts(share, time + 1))
+    restarts = base.Restarts(jnp.asarray(p.config.downstream.restart_share), time + 1)
+    episodes = base.with_restarts(episodes, states, restarts)
     return base.begin_again(episodes, key_begin)
 
 
