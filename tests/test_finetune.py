@@ -15,6 +15,7 @@ from test_checkpoint import StopAt, restored, timeless
 import maxent_jax
 from maxent_jax import algorithm, components, mixture
 from maxent_jax.algorithm import experience, finetune, training
+from maxent_jax.commands import train
 from maxent_jax.config import preset
 from maxent_jax.runs import driver, files, source
 from maxent_jax.runs.signals import Interrupted
@@ -316,3 +317,16 @@ def test_a_directory_without_a_run_gives_one_sentence(tmp_path):
 )
 def test_train_refuses_a_task_without_a_name(flags, sentence):
     assert sentence in commands.call("train", "--preset", "smoke", *flags, expect=2).stderr
+
+
+def test_a_resumed_run_does_not_need_its_source(smoke_run, on_task, tmp_path):
+    copy = tmp_path / "run"
+    shutil.copytree(on_task, copy)
+    path = copy / files.CONFIG
+    content = json.loads(path.read_text())
+    content["config"]["downstream"]["source"] = "gone"
+    path.write_text(json.dumps(content))
+    resumed = train.read_arguments(["--resume", "--out", str(copy)])
+    assert resumed.config.downstream.source == "gone"
+    gone = commands.call("finetune", "gone", "--task", "stand", expect=2).stderr
+    assert "gone is not the directory of a run" in gone

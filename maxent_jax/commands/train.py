@@ -17,7 +17,7 @@ from maxent_jax import errors
 from maxent_jax.checks import check_path
 from maxent_jax.commands import cli
 from maxent_jax.config import Config, preset, registry, tasks
-from maxent_jax.runs import files, runtime, source
+from maxent_jax.runs import files, integrity, runtime, source
 from maxent_jax.runs.claim import Claim
 from maxent_jax.runs.loggers import Sinks
 
@@ -64,7 +64,7 @@ class Arguments:
     process_id: int = 0
     """Index of this process, from 0."""
     modules: cli.Modules = ()
-    """Module, by name or path, that registers your environments, bonuses or methods."""
+    """Module, by name or path, that registers your environments, bonuses, methods or tasks."""
 
     @property
     def directory(self) -> Path:
@@ -108,7 +108,9 @@ def check_arguments(arguments: Arguments) -> None:
       UsageError, ConfigError, RunError: an argument is invalid.
     """
     arguments.config.check_registered()
-    source.check(arguments.config)
+    resumed = arguments.resume and integrity.checkpoints(arguments.directory)
+    if not resumed:  # a run that is resumed no longer needs its source
+        source.check(arguments.config)
     _check_saving(arguments)
     _check_hosts(arguments)
     Sinks(arguments.tensorboard, arguments.wandb).check()

@@ -236,6 +236,11 @@ def _check_together(c: SimpleNamespace, row: EnvironmentRow) -> None:
             "task is none: name a task.",
         ),
         (
+            c.plateau_segments and c.intrinsic_weight == 0,
+            f"plateau-segments is {c.plateau_segments}, but must be 0 with intrinsic-weight 0: a "
+            f"plateau is judged by the intrinsic reward.",
+        ),
+        (
             c.intrinsic_decay and c.intrinsic_weight == 0,
             f"intrinsic-decay is {c.intrinsic_decay}, but intrinsic-weight is 0: leave one out.",
         ),

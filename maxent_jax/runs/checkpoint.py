@@ -24,8 +24,10 @@ from orbax.checkpoint import v1 as ocp
 
 from maxent_jax import algorithm
 from maxent_jax.algorithm import State
-from maxent_jax.algorithm.training import Visits
+from maxent_jax.algorithm.experience import Step
+from maxent_jax.algorithm.training import Learner, Visits
 from maxent_jax.config import Config
+from maxent_jax.envs.base import Episodes
 from maxent_jax.errors import CheckpointError, SaveError
 from maxent_jax.mixture import Archive
 from maxent_jax.runs import files, integrity
@@ -119,8 +121,13 @@ def restore(run_directory: Path, name: str, config: Config, placed: State | None
       CheckpointError: the checkpoint does not hold a state of this config.
     """
     shapes = _shapes(config)
-    items = _load(run_directory, name, _items(_abstract(shapes, placed)))
+    wanted = _items(_abstract(shapes, placed))
+    if older := not _holds_tasks(run_directory, name):
+        wanted["rest"] = _less(wanted["rest"])
+    items = _load(run_directory, name, wanted)
     results, rest = items["results"], items["rest"]
+    if older:
+        rest = _more(rest)
     learner = rest.learner._replace(visits=results.visits, random_visits=results.random_visits)
     return _as_computed(rest._replace(archive=results.archive, learner=learner), shapes, placed)
 
@@ -140,6 +147,32 @@ def restore_results(run_directory: Path, name: str, config: Config) -> Results:
     found = _load(run_directory, name, {"results": older})["results"]
     parameters = Parameters(**found.archive.parameters)
     return found._replace(archive=found.archive._replace(parameters=parameters))
+
+
+def _holds_tasks(run_directory: Path, name: str) -> bool:
+    """Whether the checkpoint was written since there are tasks: it then holds their fields."""
+    path = (run_directory / FOLDER / name / ARRAYS).absolute()
+    return "first_steps" in ocp.checkpointables_metadata(path).metadata["rest"]["learner"]
+
+
+def _less(rest: State) -> State:
+    """Without the fields of tasks, which are None: Orbax insists on their presence."""
+    learner: Any = rest.learner._asdict()
+    episodes, items = learner["episodes"]._asdict(), learner["replay"].items._asdict()
+    del learner["first_steps"], episodes["restarts"], items["task"]
+    learner |= {"episodes": episodes, "replay": learner["replay"]._replace(items=items)}
+    return rest._replace(learner=learner)
+
+
+def _more(rest: State) -> State:
+    """The state of which `_less` gave a part."""
+    learner: Any = rest.learner
+    replay = learner["replay"]
+    found = {
+        "episodes": Episodes(**learner["episodes"]),
+        "replay": replay._replace(items=Step(**replay.items)),
+    }
+    return rest._replace(learner=Learner(**{**learner, **found}))
 
 
 def _write_progress(folder: Path, progress: Progress, machine: dict[str, Any]) -> None:

@@ -25,6 +25,7 @@ BUDGET = dict(
     updates_per_step=0.5,
     mixture_episodes=20,
     discount=0.997,
+    return_steps=10,
     first_episodes=4,
 )
 COPIES = 3  # turned copies of an episode, where the robot has any
@@ -32,7 +33,10 @@ CRITIC_STEPS, RESTART_SHARE = 9_600, 0.5
 # What only a mixture needs is not taken over.
 _OF_A_MIXTURE = {
     name: DEFAULTS[name]
-    for name in ("bonus", "mixing", "weights", "reference", "start", "refresh_period", "pooled")
+    for name in (
+        *("bonus", "mixing", "weights", "reference", "start", "refresh_period", "pooled"),
+        "plateau_segments",
+    )
 }
 
 
