@@ -3,6 +3,7 @@
 import json
 
 import commands
+import minari
 import numpy as np
 import pytest
 
@@ -73,7 +74,6 @@ def test_exorl_reads_the_transitions(written, expected):
 
 @pytest.fixture
 def minari_dataset(written, monkeypatch):
-    minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(written["minari"]))
     (name,) = minari.list_local_datasets()
     return minari.load_dataset(name)

@@ -11,7 +11,7 @@ from maxent_jax.algorithm import experience, loop, training
 from maxent_jax.algorithm.loop import SEED_AXES, State
 from maxent_jax.algorithm.training import Learner
 from maxent_jax.components import Components
-from maxent_jax.config import Config
+from maxent_jax.config import Config, names
 from maxent_jax.density import reservoir
 from maxent_jax.envs import base
 from maxent_jax.envs.base import Episodes
@@ -57,7 +57,7 @@ def _from_archive(
     p, learner = components.make(config), state.learner
     key, key_first = jax.random.split(state.key)
     returns, num_steps = jnp.full(size, jnp.nan), jnp.zeros((), jnp.int32)
-    if start_from in ("best", "mixture", "both"):
+    if start_from in names.PLAYING:
         fills = start_from != "best"
         learner, returns, num_steps = _play(
             p, learner, archive, size, num_episodes, fills, key_first
@@ -67,7 +67,7 @@ def _from_archive(
         policy = jnp.argmax(returns).astype(jnp.int32)
     elif start_from == "last":
         policy = jnp.asarray(size - 1, jnp.int32)
-    if start_from in ("last", "best", "both"):
+    if start_from in names.WITH_ITS_AGENT:
         parameters = mixture.policy(archive, policy)
         if p.config.downstream.restart_critics:
             fresh = learner.agent.parameters

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from maxent_jax import components, envs
-from maxent_jax.analysis import dataset
+from maxent_jax.analysis import dataset, gymnasium_play
 from maxent_jax.analysis.run import Run
 from maxent_jax.config import tasks
 from maxent_jax.config.registry import MUJOCO_ENVS
@@ -32,7 +32,6 @@ from maxent_jax.runs import files, integrity, locks
 
 MANIFEST = "dataset.json"
 VERSION = 1  # of the layout
-GYMNASIUM = {"ant": "Ant-v4", "walker2d": "Walker2d-v4", "humanoid": "Humanoid-v4"}
 
 Rows = dict[str, np.ndarray]
 
@@ -225,7 +224,7 @@ def _to_minari(run: Run, directory: Path) -> Writer:
     env = envs.make(name, "mujoco", torque_limit=run.config.environment.torque_limit)
     assert isinstance(env, MujocoEnv)
     control = jax.jit(env.control)
-    spec = gymnasium.spec(GYMNASIUM[name])
+    spec = gymnasium.spec(gymnasium_play.IDS[name])
     spec.kwargs["exclude_current_positions_from_observation"] = False
 
     def append(rows: Rows, written: Written) -> None:

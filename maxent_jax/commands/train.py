@@ -118,8 +118,8 @@ def check_arguments(arguments: Arguments) -> None:
 
 def _default_config(argv: Sequence[str]) -> Config:
     """The config that flags change: a preset, or that of the run to resume."""
-    shaping = ("preset", "env", "method", "task")  # what defaults depend on
-    values = {name: cli.flag_value(argv, f"--{name}") for name in shaping}
+    decisive = ("preset", "env", "method", "task")
+    values = {name: cli.flag_value(argv, f"--{name}") for name in decisive}
     given = {name: value for name, value in values.items() if value}
     out = cli.flag_value(argv, "--out")
     if "--resume" in argv and out and not given and Path(out, files.CONFIG).exists():

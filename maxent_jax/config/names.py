@@ -10,5 +10,7 @@ MIXINGS = ("episode", "step")
 WEIGHTS = ("method", *registry.WEIGHTS)
 REFERENCES = ("method", *registry.REFERENCES)
 STARTS = ("method", *registry.STARTS)
-PLAYING = ("best", "mixture", "both")  # what plays first episodes
+# What a run can start from, of another run. In the first group, its policies play first episodes.
+PLAYING = ("best", "mixture", "both")
+WITH_ITS_AGENT = ("last", "best", "both")
 STARTED_FROM = ("scratch", "last", *PLAYING)

@@ -124,6 +124,6 @@ def on_task(
         budget = dict(BUDGET)
         if of_source.learner.yaw_copies:
             budget["yaw_copies"] = COPIES
-        if start_from in ("last", "best", "both"):
+        if start_from in names.WITH_ITS_AGENT:
             budget["critic_steps"] = CRITIC_STEPS
     return of_source.replace(**(_OF_A_MIXTURE | budget | of_method | of_task | own | changes))
