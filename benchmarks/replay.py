@@ -56,7 +56,8 @@ def insert_seconds(config: Config, full: bool, repeats: int) -> float:
     state = jnp.ones((n, sac.observation_size))
     flags = jnp.zeros((3, n), bool)
     transition = Transition(
-        state, jnp.zeros((n, sac.action_size)), state, flags[0], flags[1], ~flags[2]
+        *(state, jnp.zeros((n, sac.action_size)), state),
+        *(flags[0], flags[1], ~flags[2], jnp.zeros(n)),
     )
     reference = Reference(
         jax.random.normal(jax.random.key(0), (config.mixture.reference_size, len(p.phi.names))),

@@ -1,7 +1,9 @@
 """Task rewards: what a run is paid for reaching a state, if it has a task.
 
 A task is a pure function of a transition (observation, action, next observation), so that
-transitions of one task can be paid for another. The names are those of `config.tasks.FAMILIES`.
+transitions of one task can be paid for another. Only `environment` is not: it is what an
+environment of brax, Playground or the user pays itself. The names are those of
+`config.tasks.FAMILIES`.
 """
 
 from collections.abc import Callable
@@ -32,8 +34,18 @@ class Reward(Protocol):
 class Task(NamedTuple):
     """A task of an environment."""
 
-    reward: Reward
+    reward: Reward | None  # None: the environment's own
     sparse: bool  # 0 or 1: an episode with a reward is a success
+
+    def pay(
+        self,
+        observation: jax.Array,
+        action: jax.Array,
+        next_observation: jax.Array,
+        own: jax.Array,
+    ) -> jax.Array:
+        """Rewards transitions [...], whose rewards by the environment itself are `own` [...]."""
+        return own if self.reward is None else self.reward(observation, action, next_observation)
 
 
 def register(name: str, reward: Reward, sparse: bool = False) -> None:
@@ -64,6 +76,8 @@ def make(name: str, env_name: str, env: Env) -> Task:
     names.check_registered(name)
     if name in names.USERS:
         return Task(names.USERS[name].reward, task.sparse)
+    if task.family == names.OWN:
+        return Task(None, task.sparse)
     if env_name not in MUJOCO_ENVS:
         return Task(_CLASSIC[env_name], task.sparse)
     assert isinstance(env, MujocoEnv)

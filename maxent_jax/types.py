@@ -37,6 +37,7 @@ class Transition(NamedTuple):
     terminated: jax.Array  # [...] bool: the episode ended in a terminal state
     truncated: jax.Array  # [...] bool: only the time limit ended it
     valid: jax.Array  # [...] bool
+    reward: jax.Array  # [...] the environment's own, for the task `environment`; else unused
 
 
 class Distances(NamedTuple):

@@ -55,7 +55,8 @@ def filled(p, num_steps, seed=0, invalid=0.1):
         reached = np.where(valid[:, None], reached, current)
         action = rng.uniform(-1, 1, (NUM_ENVS, num_actions)).astype(np.float32)
         bonus = rng.random(NUM_ENVS).astype(np.float32)
-        transition = Transition(current, action, reached, terminated, truncated, valid)
+        own = np.zeros(NUM_ENVS, np.float32)
+        transition = Transition(current, action, reached, terminated, truncated, valid, own)
         ring, rows = add(
             measured_against, ring, jax.tree.map(jnp.asarray, transition), jnp.asarray(place),
             jnp.asarray(bonus), jax.random.key(step),
@@ -189,7 +190,7 @@ def test_16_bits_hold_what_is_too_large_for_them_as_their_largest():
     huge = np.full((NUM_ENVS, SIZE), 1e6, np.float32) * np.sign(np.arange(SIZE) - 10.5)
     transition = Transition(
         huge, np.zeros((NUM_ENVS, 8), np.float32), huge, *np.zeros((2, NUM_ENVS), bool),
-        np.ones(NUM_ENVS, bool),
+        np.ones(NUM_ENVS, bool), np.zeros(NUM_ENVS, np.float32),
     )  # fmt: skip
     ring, _ = experience.add(
         p, reference(np.random.default_rng(0), 7), experience.init(p),

@@ -17,6 +17,7 @@ from maxent_jax import algorithm, components, mixture
 from maxent_jax.algorithm import experience, finetune, training
 from maxent_jax.commands import train
 from maxent_jax.config import preset
+from maxent_jax.config.registry import ENVS
 from maxent_jax.runs import driver, files, source
 from maxent_jax.runs.signals import Interrupted
 from maxent_jax.sac import agent
@@ -49,6 +50,11 @@ def archive_of(config, biases):
     for parameters in made:
         archive = mixture.append(archive, parameters)
     return archive
+
+
+def on_forward(directory, **changes):
+    """The config of a run on the task `forward` that starts from the run in a directory."""
+    return source.on_task(files.read_config(directory), str(directory), "forward", **changes)
 
 
 def equal(one, other):
@@ -105,6 +111,15 @@ def test_the_replay_holds_the_first_episodes():
     assert goes_on.sum() == len(begins) - begins.sum()
     assert int(first.num_steps) == len(begins)
     assert int(state.learner.visits.cells.sum() + state.learner.visits.off_grid) == len(begins)
+
+
+def test_if_no_episode_succeeds_the_newest_policy_and_all_episodes_are_used():
+    config = task_config(task="user:beyond", start_from="both", restart_share=0.5)
+    state, first = finetune.start(config, archive_of(config, [-0.1, 0.0, -0.2]))
+    assert (first.task_return == 0).all() and int(first.policy) == 2
+    episodes = state.learner.episodes
+    within = np.asarray(episodes.starts.obs[-episodes.restarts.age.shape[0] :])
+    assert within[:, 0].min() < -1.0 and (np.abs(within[:, 0]) < 0.5).mean() > 0.2
 
 
 def test_restarts_are_states_of_successful_episodes():
@@ -244,7 +259,7 @@ def test_a_finished_run_is_left_alone_and_another_start_is_refused(smoke_run, on
 
 @pytest.mark.slow
 def test_a_stopped_run_ends_as_one_that_was_not(smoke_run, tmp_path, monkeypatch):
-    config = source.on_task(smoke_run, "run:0", start_from="both", intrinsic_weight=0.1)
+    config = on_forward(smoke_run, intrinsic_weight=0.1)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     for directory in (whole, broken):
         directory.mkdir()
@@ -271,11 +286,24 @@ def test_seeds_side_by_side_start_from_one_archive():
 
 
 def test_a_seed_of_several_can_be_chosen(two_seeds):
-    archives = [
-        source.load(source.on_task(two_seeds, "forward", source_seed=i))[0] for i in range(2)
-    ]
-    for i, archive in enumerate(archives):
+    for i in range(2):
+        archive, _ = source.load(on_forward(two_seeds, source_seed=i))
         assert equal(archive.parameters, maxent_jax.load_run(two_seeds, i).mixture.parameters)
+
+
+@pytest.mark.parametrize("env", ENVS)
+def test_every_environment_has_a_budget_for_its_tasks(env):
+    for method in ("v", "apt"):
+        config = source.on_task(preset("quick", env=env, method=method), "there", "gymnasium")
+        assert config.budget.num_iterations == 8 and config.downstream.source == "there"
+
+
+def test_a_run_can_be_used_as_it_was_after_fewer_iterations(smoke_run):
+    whole, _ = source.load(on_forward(smoke_run))
+    part, _ = source.load(on_forward(smoke_run, source_iterations=1))
+    assert (int(whole.size), int(part.size)) == (3, 2)
+    _, first = finetune.start(on_forward(smoke_run, source_iterations=1, first_episodes=1), part)
+    assert first.task_return.shape == (2,)
 
 
 @pytest.mark.parametrize(
@@ -288,6 +316,7 @@ def test_a_seed_of_several_can_be_chosen(two_seeds):
         (("--task", "stand", "--first-episodes", "0"), "first-episodes is 0, but must be at least"),
         (("--task", "stand", "--hidden-size", "64"), "hidden-size is 64, but must be 32, as in "),
         (("--task", "stand", "--source-seed", "1"), "source-seed is 1, but must be below 1"),
+        (("--task", "stand", "--source-iterations", "3"), "but must be at most 2, the number of"),
         (
             ("--task", "stand", "--from", "last", "--restart-share", "0.1"),
             "restart-share is 0.1, but must be 0 with start-from last",

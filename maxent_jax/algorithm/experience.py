@@ -238,13 +238,14 @@ def _task_rewards(
     """Rewards [N, V] of the task for transitions and their copies; None without a task."""
     if components.task is None:
         return None
-    pay, (observation, action, next_observation, *_) = components.task.reward, transition
-    own = pay(observation, action, next_observation)[:, None]
+    pay, (observation, action, next_observation, *_) = components.task.pay, transition
+    paid = pay(observation, action, next_observation, transition.reward)[:, None]
     if angle is None:
-        return own
+        return paid
     turned = [_rotated(components, s[:, None], angle) for s in (observation, next_observation)]
     actions = jnp.broadcast_to(action[:, None], (*angle.shape, action.shape[-1]))
-    return jnp.concatenate([own, pay(turned[0], actions, turned[1])], axis=-1)
+    # No environment that can be turned has a reward of its own.
+    return jnp.concatenate([paid, pay(turned[0], actions, turned[1], paid)], axis=-1)
 
 
 def _variants(components: Components, state: jax.Array, angle: jax.Array | None) -> jax.Array:

@@ -63,8 +63,8 @@ def _from_archive(
             p, learner, archive, size, num_episodes, fills, key_first
         )
     policy = jnp.asarray(-1, jnp.int32)
-    if start_from in ("best", "both"):
-        policy = jnp.argmax(returns).astype(jnp.int32)
+    if start_from in ("best", "both"):  # the newest of equals: of a sparse task all may fail
+        policy = (size - 1 - jnp.argmax(returns[::-1])).astype(jnp.int32)
     elif start_from == "last":
         policy = jnp.asarray(size - 1, jnp.int32)
     if start_from in names.WITH_ITS_AGENT:
@@ -162,14 +162,16 @@ def _groups_side_by_side(x: jax.Array) -> jax.Array:
 def _restarting(p: Components, episodes: Episodes, found: _Episode, key: jax.Array) -> Episodes:
     """Lets a share of the episodes begin at states of the best tenth of those that were found.
 
-    An episode is drawn in proportion to how far its return is above the worst.
+    An episode is drawn in proportion to how far its return is above the worst. If all returns are
+    equal, as when a sparse task was never solved, all episodes are alike.
     """
     key_episode, key_time, key_begin = jax.random.split(key, 3)
     num = min(training.NUM_RESTARTS, p.config.environment.num_starts)
-    returns, best = jax.lax.top_k(found.task_return, -(-found.task_return.shape[0] // 10))
-    above = returns - jnp.min(found.task_return)  # so that of a sparse task only successes count
+    returns = found.task_return
+    least_of_best = jax.lax.top_k(returns, -(-returns.shape[0] // 10))[0][-1]
+    above = jnp.where(returns >= least_of_best, returns - jnp.min(returns), 0.0)
     share = jnp.where(jnp.max(above) > 0, above, 1.0)
-    chosen = jax.random.choice(key_episode, best, (num,), p=share / jnp.sum(share))
+    chosen = jax.random.choice(key_episode, share.shape[0], (num,), p=share / jnp.sum(share))
     logits = jnp.where(found.goes_on[:, chosen], 0.0, -jnp.inf)
     time = jax.random.categorical(key_time, logits, axis=0)
     states = jax.tree.map(lambda x: x[time, chosen], found.env)
@@ -195,6 +197,7 @@ def _filled(
         terminated=reached.terminated,
         truncated=jnp.zeros_like(reached.terminated),
         valid=reached.alive,
+        reward=reached.env.reward,
     )
     no_bonus = jnp.zeros(previous.shape[0])
 

@@ -130,8 +130,8 @@ def _episodes(
         "features": components.phi(reached.states),
     }
     if components.task is not None:
-        pay = components.task.reward
-        rows["rewards"] = pay(rows["observations"], reached.actions, reached.states)
+        before, own = rows["observations"], reached.env.reward
+        rows["rewards"] = components.task.pay(before, reached.actions, reached.states, own)
     if physics:
         rows["next_physics"] = _simulator_state(reached.env)
         first = _simulator_state(starts)[None]

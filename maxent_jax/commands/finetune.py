@@ -33,7 +33,7 @@ class Arguments(train.Arguments):
     def directory(self) -> Path:
         """The new run's directory: --out, or one named after the run, the task and the start."""
         own = self.config.downstream
-        task = train.as_file_name(own.task)
+        task = files.as_name(own.task)
         return self.out or Path(f"{self.run}-{task}-{own.start_from}-{self.config.seed}")
 
 
@@ -63,7 +63,7 @@ def _default_config(argv: Sequence[str]) -> Config:
         known = ", ".join(tasks.of_environment(of_source.env))
         raise errors.UsageError(f"the task is missing: add --task, one of {known}.")
     given = cli.flag_value(argv, "--from") or cli.flag_value(argv, "--start-from")
-    return source.on_task(directory, task, given or source.DEFAULT_START)
+    return source.on_task(of_source, str(directory), task, given or source.DEFAULT_START)
 
 
 def main(argv: Sequence[str]) -> None:

@@ -53,7 +53,8 @@ class Arguments:
     jobs: int = 1
     """Processes that share the cells and the cores of this machine."""
     shard: str = "0/1"
-    """I/N: train only the cells I, I + N, I + 2N, ...; for job arrays."""
+    """I/N: train only the cells I, I + N, I + 2N, ..., and those that start from them; for job
+    arrays."""
     figures: bool = True
     """Draw the figures once all cells are finished."""
 
@@ -80,7 +81,8 @@ def main(argv: Sequence[str]) -> None:
         _share(arguments)
     else:
         failures = sum(
-            _train(arguments.out / name, cells[index::count]) for name, cells in studies.items()
+            _train(arguments.out / name, protocol.share(cells, index, count))
+            for name, cells in studies.items()
         )
         if failures:
             sys.exit(1)
@@ -120,25 +122,39 @@ def _check(arguments: Arguments) -> tuple[int, int]:
 
 
 def _train(directory: Path, cells: Sequence[Cell]) -> int:
-    """Trains the unfinished cells that no other process trains; returns how many failed."""
-    failures = 0
-    for cell in cells:
-        started = time.perf_counter()
-        try:
-            if protocol.finished(directory, cell):
-                continue
-            at = protocol.home(directory, cell)
-            runtime.prepare(cell.config.simulates_in_jax)
-            with Claim(at, cell.config, resume=True).hold():
-                from maxent_jax.runs import driver  # loads jax
+    """Trains the unfinished cells that no other process trains; returns how many failed.
 
-                train.run_to_end(cell.config, at, started, driver.Options(fallback=True))
-        except locks.BusyError:
-            continue
-        except (errors.RunError, errors.NonFiniteError) as error:
-            print(f"error: {error} Continuing with the next cell.", file=sys.stderr)
-            failures += 1
+    Cells that start from another one wait until that is finished.
+    """
+    failures, left, trained = 0, cells, True
+    while trained:
+        now, left, trained = left, [], False
+        for cell in now:
+            try:
+                if cell.source and not protocol.finished(directory, cell.source):
+                    left.append(cell)
+                else:
+                    trained |= _train_cell(directory, cell)
+            except locks.BusyError:
+                continue
+            except (errors.RunError, errors.NonFiniteError) as error:
+                print(f"error: {error} Continuing with the next cell.", file=sys.stderr)
+                failures += 1
     return failures
+
+
+def _train_cell(directory: Path, cell: Cell) -> bool:
+    """Trains the cell's run to its end; returns whether there was anything left to do."""
+    started = time.perf_counter()
+    if protocol.finished(directory, cell):
+        return False
+    at, config = protocol.home(directory, cell), protocol.config_of(directory, cell)
+    runtime.prepare(config.simulates_in_jax)
+    with Claim(at, config, resume=True).hold():
+        from maxent_jax.runs import driver  # loads jax
+
+        train.run_to_end(config, at, started, driver.Options(fallback=True))
+    return True
 
 
 def _share(arguments: Arguments) -> None:

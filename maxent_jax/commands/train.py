@@ -72,18 +72,13 @@ class Arguments:
         c = self.config
         paid_by = c.method
         if c.downstream.task != tasks.NONE:
-            paid_by += f"-{as_file_name(c.downstream.task)}"
+            paid_by += f"-{files.as_name(c.downstream.task)}"
         return self.out or Path("runs") / f"{c.env}-{paid_by}-{c.preset}-{c.seed}"
 
     @property
     def claim(self) -> Claim:
         """What the run asks of its directory."""
         return Claim(self.directory, self.config, self.resume, self.overwrite)
-
-
-def as_file_name(task: str) -> str:
-    """Returns the name of a task as a part of a file name: goal:15,0 is goal_15_0."""
-    return re.sub(r"[^\w.-]", "_", task)
 
 
 def read_arguments(argv: Sequence[str]) -> Arguments:

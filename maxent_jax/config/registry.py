@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from maxent_jax.checks import check_choice
 from maxent_jax.errors import ConfigError, ConfigTypeError, UsageError
 
-USER = "user:"
+USER, BRAX, PLAYGROUND = "user:", "brax:", "playground:"
 BY_METHOD = -1  # as a refresh period: the method's own
 CORRECTIVE = "fully_corrective"
 WEIGHTS = ("uniform", "geometric", "last", CORRECTIVE)
@@ -79,7 +79,21 @@ BRAX_ENVS = (
     *("ant", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum"),
     *("inverted_double_pendulum", "pusher", "reacher", "swimmer", "walker2d"),
 )
-_BRAX = EnvironmentRow(backends=("auto", "mjx"))
+# Without the Reachers, which Playground 0.2 cannot load with MuJoCo 3.17.
+PLAYGROUND_ENVS = (
+    *("AcrobotSwingup", "AcrobotSwingupSparse", "BallInCup", "CartpoleBalance"),
+    *("CartpoleBalanceSparse", "CartpoleSwingup", "CartpoleSwingupSparse", "CheetahRun"),
+    *("FingerSpin", "FingerTurnEasy", "FingerTurnHard", "FishSwim", "HopperHop", "HopperStand"),
+    *("HumanoidRun", "HumanoidStand", "HumanoidWalk", "PendulumSwingup", "PointMass"),
+    *("SwimmerSwimmer6", "WalkerRun", "WalkerStand", "WalkerWalk"),
+)
+_BY_PREFIX = {
+    **{f"{BRAX}{name}": EnvironmentRow(backends=("auto", "mjx")) for name in BRAX_ENVS},
+    **{
+        f"{PLAYGROUND}{name}": EnvironmentRow(backends=("auto", "mjx", "warp"))
+        for name in PLAYGROUND_ENVS
+    },
+}
 _USERS = EnvironmentRow(backends=BACKENDS, physics=PHYSICS)
 
 BONUSES = {
@@ -159,11 +173,10 @@ def environment(name: str) -> EnvironmentRow:
     Raises:
       ConfigError: the name is unknown.
     """
-    brax = tuple(f"brax:{env}" for env in BRAX_ENVS)
     if is_users(name):
         return ENVIRONMENTS.get(name, _USERS)
-    check_choice("env", name, (*ENVS, *brax))
-    return _BRAX if name in brax else ENVIRONMENTS[name]
+    check_choice("env", name, (*ENVS, *_BY_PREFIX))
+    return _BY_PREFIX[name] if name in _BY_PREFIX else ENVIRONMENTS[name]
 
 
 def method(name: str) -> MethodRow:
@@ -245,12 +258,22 @@ def register_method(
 
 
 def check_registered(env: str, method_name: str, bonus_name: str) -> None:
-    """Raises ConfigError if one of these names begins with "user:" and is not registered."""
+    """Raises ConfigError if a "user:" name is not registered, or an environment not installed."""
     if is_users(env) and env not in ENVIRONMENTS:
         raise not_registered("environment", env)
+    check_installed(env)
     method(method_name)
     if bonus_name != "none":
         bonus(bonus_name)
+
+
+def check_installed(env: str) -> None:
+    """Raises ConfigError if the environment needs a package that is not installed."""
+    if env.startswith(PLAYGROUND) and importlib.util.find_spec("mujoco_playground") is None:
+        raise ConfigError(
+            f"env '{env}' needs the package playground, which is in the extra 'playground': "
+            f"install it."
+        )
 
 
 def resolve(where: Any) -> Any:

@@ -187,6 +187,8 @@ class Downstream(_Checked):
     """Directory of the run to start from."""
     source_seed: int = 0
     """Which seed of that run, from 0, if it has several."""
+    source_iterations: int = 0
+    """Use only the policies of that run's first iterations, this many; 0: all."""
     restart_share: float = 0.0
     """Share of the episodes that begin at a state of the best tenth of the first episodes."""
     critic_steps: int = 0
@@ -215,7 +217,8 @@ class Config(_Checked):
     """Settings of a run."""
 
     env: str = "ant"
-    """ant, walker2d, humanoid, pendulum, mountain_car, brax:NAME, or user:NAME (see --import)."""
+    """ant, walker2d, humanoid, pendulum, mountain_car, brax:NAME, playground:NAME, or user:NAME
+    (see --import)."""
     method: str = "v"
     """h (Hazan 2019), la (Liu & Abbeel 2021), v (Veritas), h-official, a bonus as a baseline, or
     task (one policy, paid by --task alone)."""
@@ -262,7 +265,8 @@ class Config(_Checked):
     @property
     def simulates_in_jax(self) -> bool:
         """Whether MJX or brax computes the physics, as far as is known before jax is loaded."""
-        return self.environment.backend == "mjx" or self.env.startswith("brax:")
+        theirs = (registry.BRAX, registry.PLAYGROUND)
+        return self.environment.backend == "mjx" or self.env.startswith(theirs)
 
     @property
     def own_bonus(self) -> str:
@@ -333,7 +337,7 @@ DATA_FIELDS = (
     *("method", "preset", "seed", "num_seeds"),
     *("weights", "eta", "reference", "refresh_period", "start"),
     *("plateau_segments", "plateau_tolerance"),
-    *("source", "source_seed", "start_from", "first_episodes"),
+    *("source", "source_seed", "source_iterations", "start_from", "first_episodes"),
 )
 
 

@@ -13,7 +13,7 @@ from maxent_jax.config import registry
 from maxent_jax.config.registry import ENVS, MUJOCO_ENVS
 from maxent_jax.errors import ConfigError, ConfigTypeError
 
-NONE = "none"
+NONE, OWN = "none", "environment"
 
 
 class Family(NamedTuple):
@@ -39,6 +39,7 @@ FAMILIES = {
     "stand": Family(MUJOCO_ENVS),
     "jump": Family(MUJOCO_ENVS),
     "flip": Family(("walker2d",), settings={"end_unhealthy": False}),
+    OWN: Family(()),  # of every environment that is not one of ENVS
 }
 
 
@@ -72,7 +73,7 @@ def parse(name: str, env: str) -> Task:
     kind, _, text = name.partition(":")
     check_choice("task", kind, FAMILIES)
     family = FAMILIES[kind]
-    if env not in family.envs:
+    if not _has(env, kind):
         raise ConfigError(f"task is {name}, but {env} has only: {', '.join(of_environment(env))}.")
     names = _names(family, env)
     try:
@@ -92,8 +93,12 @@ def parse(name: str, env: str) -> Task:
 
 def of_environment(env: str) -> list[str]:
     """Returns the forms of the names of an environment's tasks, such as goal:X,Y,RADIUS."""
-    forms = [_form(kind, env) for kind, family in FAMILIES.items() if env in family.envs]
+    forms = [_form(kind, env) for kind in FAMILIES if _has(env, kind)]
     return [*forms, "user:NAME"]
+
+
+def _has(env: str, kind: str) -> bool:
+    return env not in ENVS if kind == OWN else env in FAMILIES[kind].envs
 
 
 def settings(name: str, env: str) -> Mapping[str, Any]:

@@ -40,7 +40,8 @@ _AT_MOST_ONE = (
 _NOT_NEGATIVE = (
     *("seed", "plateau_segments", "plateau_tolerance", "shaping", "episodic_weight"),
     *("alive_bonus", "actor_average"),
-    *("intrinsic_weight", "intrinsic_decay", "source_seed", "critic_steps", "restart_share"),
+    *("intrinsic_weight", "intrinsic_decay", "source_seed", "source_iterations"),
+    *("critic_steps", "restart_share"),
     *("yaw_copies", "discount", "target_entropy_scale", "policy_lag"),
 )
 

@@ -1,7 +1,8 @@
 """Environments by name: `make(name)` returns a brax Env, and base.py steps many in parallel.
 
 A name is that of a Gymnasium task or a classic environment (config.registry.ENVS), `brax:NAME` for
-an environment of brax, or `user:NAME` for one that was added by `register`.
+an environment of brax, `playground:NAME` for one of MuJoCo Playground's, or `user:NAME` for one
+that was added by `register`.
 """
 
 import contextlib
@@ -43,9 +44,10 @@ def make(name: str, backend: str = "auto", physics: str = "reference", **deviati
     """Makes the environment of a name.
 
     Args:
-      name: one of ENVS, "brax:NAME" or "user:NAME".
+      name: one of ENVS, "brax:NAME", "playground:NAME" or "user:NAME".
       backend: "mjx", "mujoco" (C MuJoCo), "warp", or "auto": `mujoco` on a CPU, else `mjx`. Classic
-        environments have only "auto"; brax's have "auto" (brax's default) and "mjx".
+        environments have only "auto"; brax's have "auto" (brax's default) and "mjx";
+        Playground's have "auto" and "mjx", which are the same, and "warp".
       physics: "reference" (the XML's options) or, for Gymnasium's tasks, "fast" (the task's).
       **deviations: from Gymnasium's task, see MujocoEnv.
     Raises:
@@ -70,8 +72,9 @@ def entry(name: str) -> Entry:
       ConfigError: the name is unknown.
     """
     row = registry.environment(name)
-    if name.startswith("brax:"):
-        return Entry(functools.partial(_make_brax, name.removeprefix("brax:")), DEFAULT_GRID)
+    for prefix, make_theirs in _THEIRS.items():
+        if name.startswith(prefix):
+            return Entry(functools.partial(make_theirs, name.removeprefix(prefix)), DEFAULT_GRID)
     if row.entry is None:
         raise registry.not_registered("environment", name)
     return resolve(row.entry)
@@ -88,7 +91,8 @@ def register(
     Args:
       name: NAME.
       make: backend, physics -> a brax Env with observation [D], D at least 2, and action [A] in
-        [-1, 1]. Its reward is not used; its `done` marks a terminal state.
+        [-1, 1]. Its reward is used by the task `environment` alone; its `done` marks a terminal
+        state.
       grid: where coverage is measured; by default the observation's first two entries, within ±10.
       phi: the feature map, [..., D] -> [..., F], with `.names`; by default the observation's first
         two entries and five random projections of the others.
@@ -164,3 +168,12 @@ def _make_brax(name: str, backend: str, _physics: str) -> Env:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Brax System")  # it says that MJX is better maintained
         return brax_envs.get_environment(name, **options)
+
+
+def _make_playground(name: str, backend: str, _physics: str) -> Env:
+    from maxent_jax.envs.playground import PlaygroundEnv
+
+    return PlaygroundEnv(name, backend)
+
+
+_THEIRS = {registry.BRAX: _make_brax, registry.PLAYGROUND: _make_playground}

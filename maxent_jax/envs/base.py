@@ -137,6 +137,7 @@ def _goes_on(
         terminated=terminated,
         truncated=truncated,
         valid=valid,
+        reward=jnp.where(valid, after.reward, 0.0),
     )
     ended = terminated | truncated
     start, first_age = _draw_beginnings(episodes, age.shape[0], key)

@@ -153,7 +153,7 @@ def task_returns(components: Components, starts: State, reached: Trajectories) -
     if components.task is None:
         return None
     before = jnp.concatenate([starts.obs[None], reached.states[:-1]])
-    paid = components.task.reward(before, reached.actions, reached.states)
+    paid = components.task.pay(before, reached.actions, reached.states, reached.env.reward)
     return jnp.sum(jnp.where(reached.alive, paid, 0.0), axis=0)
 
 

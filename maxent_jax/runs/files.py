@@ -1,14 +1,16 @@
 """Reads and writes the config and metrics in a run's directory. Loads no array library."""
 
 import contextlib
+import csv
 import dataclasses
 import importlib.metadata
 import json
 import math
 import os
 import platform
+import re
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -187,6 +189,22 @@ def write_metrics(directory: Path, rows: list[dict[str, Any]]) -> None:
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Writes a JSON file atomically; numbers that are not finite become null."""
     _replace(path, json.dumps(jsonable(content), indent=2) + "\n")
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
+    """Writes a CSV file with these columns, completely or not at all."""
+    with (
+        whole_file(path) as temporary,
+        open(temporary, "w", encoding="utf-8", newline="") as file,
+    ):
+        writer = csv.DictWriter(file, columns, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def as_name(text: str) -> str:
+    """Returns a text as a part of a file name: goal:15,0 is goal_15_0."""
+    return re.sub(r"[^\w.-]", "_", text)
 
 
 def jsonable(value: Any) -> Any:

@@ -28,6 +28,11 @@ def checkpoints(run_directory: Path) -> list[str]:
     return [m[0] for m in sorted((m for m in found if m), key=_how_far)]
 
 
+def complete_iterations(run_directory: Path) -> int:
+    """Returns how many iterations were complete at the latest checkpoint; 0 without one."""
+    return max((int(name.split("+")[0]) for name in checkpoints(run_directory)), default=0)
+
+
 def clear_unfinished(run_directory: Path) -> None:
     """Removes the unfinished checkpoint of a killed process."""
     for path in (run_directory / FOLDER).glob(f"{UNFINISHED}*"):

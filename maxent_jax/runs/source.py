@@ -1,7 +1,7 @@
 """The run that another run starts from. Loads no array library before `load` does."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from maxent_jax.config import DEFAULTS, Config, names, registry, tasks
 from maxent_jax.errors import ConfigError
@@ -18,11 +18,12 @@ NETWORKS = (
 DEFAULT_START = "both"
 # 154,000 env steps, after each eighth of which the agent is measured; Ant's first episodes take
 # another 43,000.
-BUDGET = dict(
+BUDGET: dict[str, Any] = dict(
     num_iterations=8,
     steps_per_iteration=19_200,
     num_segments=5,
-    updates_per_step=0.5,
+    updates_per_step=1.0,
+    actor_average=1e-3,
     mixture_episodes=20,
     discount=0.997,
     return_steps=10,
@@ -46,7 +47,7 @@ def check(config: Config) -> None:
     Raises:
       RunError: the source is not the directory of a run.
       CheckpointError: the source has no checkpoint yet.
-      ConfigError: its networks differ, or it has no such seed.
+      ConfigError: its networks differ, or it has no such seed or iteration.
     """
     own = config.downstream
     if own.restart_share and own.start_from not in names.PLAYING:
@@ -71,6 +72,12 @@ def check(config: Config) -> None:
             f"source-seed is {own.source_seed}, but must be below {of_source.num_seeds}, the "
             f"number of seeds of {directory}."
         )
+    complete = integrity.complete_iterations(directory)
+    if own.source_iterations > complete:
+        raise ConfigError(
+            f"source-iterations is {own.source_iterations}, but must be at most {complete}, the "
+            f"number of complete iterations of {directory}."
+        )
 
 
 def load(config: Config) -> "tuple[Archive, str]":
@@ -89,39 +96,45 @@ def load(config: Config) -> "tuple[Archive, str]":
     archive = checkpoint.restore_results(directory, name, of_source).archive
     if of_source.num_seeds > 1:
         archive = jax.tree.map(lambda x: x[config.downstream.source_seed], archive)
+    if iterations := config.downstream.source_iterations:
+        policies = 1 + iterations * of_source.mixture.snapshots
+        archive = archive._replace(size=jax.numpy.minimum(archive.size, policies))
     return archive, name
 
 
 def on_task(
-    directory: Path, task: str, start_from: str = DEFAULT_START, **changes: object
+    of_source: Config, source: str, task: str, start_from: str = DEFAULT_START, **changes: object
 ) -> Config:
-    """Returns the config of a run on a task that starts from the run in a directory.
+    """Returns the config of a run on a task that starts from another run.
 
     It has the settings of that run, but those of the method `task` and its own budget.
 
     Args:
-      directory: of the run to start from.
+      of_source: config of the run to start from.
+      source: directory of that run; may be empty if nothing is taken from it.
       task: the name of the task.
       start_from: what to take from that run.
       **changes: settings by name.
     Raises:
-      RunError, ConfigError: the directory holds no run, or a setting is invalid.
+      ConfigError: a setting is invalid.
     """
-    of_source = files.read_config(directory)
     of_method = dict(registry.method(registry.TASK).settings)
     of_task = dict(tasks.settings(task, of_source.env))
     own = {
         "method": registry.TASK,
         "task": task,
         "num_seeds": 1,
-        "source": str(directory),
+        "random_baseline": False,
+        "source": source,
         "start_from": start_from,
     }
     if start_from in names.PLAYING:
         own["restart_share"] = RESTART_SHARE
-    budget: dict[str, object] = {}
+    budget: dict[str, Any] = {}
     if of_source.preset != "smoke":
         budget = dict(BUDGET)
+        states = BUDGET["mixture_episodes"] * of_source.environment.episode_length
+        budget["reference_size"] = min(of_source.mixture.reference_size, states)
         if of_source.learner.yaw_copies:
             budget["yaw_copies"] = COPIES
         if start_from in names.WITH_ITS_AGENT:

@@ -161,6 +161,82 @@ def along(
     return figure
 
 
+def scores(groups: Sequence[Mapping[str, Any]], title: str) -> Figure:
+    """Draws the scores of tasks: of all together over the env steps explored, and of each task.
+
+    The first two panels show interquartile means and optimality gaps with their intervals, the
+    others the score of every seed with the most exploration, and their interquartile mean.
+
+    Args:
+      groups: as from `downstream.summarise`.
+    """
+    tasks = list(dict.fromkeys(task for group in groups for task in group["tasks"]))
+    most: dict[str, Mapping[str, Any]] = {}
+    for group in sorted(groups, key=lambda group: group["explored_steps"]):
+        most[group["method"]] = group
+    styles, columns = _styles(list(most)), 4
+    rows = 1 + -(-len(tasks) // columns)
+    figure = Figure(figsize=(13, 2.9 * rows), layout="constrained")
+    grid = figure.add_gridspec(rows, columns)
+    whole = [figure.add_subplot(grid[0, :2]), figure.add_subplot(grid[0, 2:])]
+    for ax, value, interval, label in (
+        (whole[0], "interquartile_mean", "interval", "score, interquartile mean"),
+        (whole[1], "optimality_gap", "gap_interval", "optimality gap"),
+    ):
+        for method, style in styles.items():
+            own = [group for group in groups if group["method"] == method]
+            own.sort(key=lambda group: group["explored_steps"])
+            middle = np.array([group[value] for group in own])
+            low, high = np.array([group[interval] for group in own]).T
+            if [group["explored_steps"] for group in own] == [0]:
+                ax.axhline(middle[0], label=method, **style)
+                ax.axhspan(low[0], high[0], color=style["color"], alpha=0.12, lw=0)
+                continue
+            x = [group["explored_steps"] / 1e3 for group in own]
+            ax.errorbar(x, middle, (middle - low, high - middle), capsize=3, label=method, **style)
+        ax.set(xlabel="thousand env steps of exploration", ylabel=label)
+        ax.grid(alpha=0.25)
+    for i, task in enumerate(tasks):
+        ax = figure.add_subplot(grid[1 + i // columns, i % columns])
+        for place, (method, group) in enumerate(most.items()):
+            of_task, color = group["tasks"].get(task), styles[method]["color"]
+            if of_task is None:
+                continue
+            ax.plot([place] * len(of_task), of_task, "o", ms=4, color=color, alpha=0.6)
+            level = float(interquartile_mean([np.asarray(of_task)]))
+            ax.plot([place - 0.3, place + 0.3], [level, level], color=color)
+        ax.set_xticks(range(len(most)), list(most), fontsize=8)
+        ax.set_title(task, fontsize=9)
+        ax.grid(alpha=0.25, axis="y")
+    handles, labels = whole[0].get_legend_handles_labels()
+    figure.legend(handles, labels, frameon=False, ncols=8, loc="outside lower center")
+    figure.suptitle(f"{title}: score 0 is the untrained policy's, 1 an expert's")
+    return figure
+
+
+def returns(tables: Mapping[str, Mapping[str, Mapping[str, Any]]], title: str) -> Figure:
+    """Draws each seed's return, its interquartile mean and interval; a panel for each task.
+
+    Args:
+      tables: by environment and task, as from `statistics.compare`.
+    """
+    figure = Figure(figsize=(4 * len(tables) + 1, 3.6), layout="constrained")
+    panels = zip(figure.subplots(1, len(tables), squeeze=False)[0], tables.items(), strict=True)
+    styles = _styles(list(next(iter(tables.values()))))
+    for ax, (task, by_data) in panels:
+        for place, (name, found) in enumerate(by_data.items()):
+            color, middle = styles[name]["color"], found["interquartile_mean"]
+            low, high = found["interval"]
+            ax.plot([place] * len(found["values"]), found["values"], "o", ms=4, color=color)
+            ax.bar(place, middle, width=0.6, color=color, alpha=0.4)
+            ax.vlines(place, low, high, color=color)
+        ax.set_xticks(range(len(by_data)), [name.replace(" ", "\n") for name in by_data])
+        ax.set(title=task, ylabel="return of an episode")
+        ax.grid(alpha=0.25, axis="y")
+    figure.suptitle(f"{title}: every seed, interquartile mean, 95 % interval")
+    return figure
+
+
 def occupancies(directories: Mapping[str, Path]) -> Figure:
     """Draws Fig. 5, a row per method: log-occupancy in training and of the mixture, and paths."""
     figure = Figure(figsize=(13, 4 * len(directories)), layout="constrained")

@@ -6,20 +6,22 @@ Loads no array library.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from maxent_jax.config import DEFAULTS, Config, preset
+from maxent_jax.config import DEFAULTS, Config, preset, tasks
 from maxent_jax.config.registry import BASELINES, CLASSIC_ENVS, MUJOCO_ENVS, PLAIN
 from maxent_jax.errors import UsageError
-from maxent_jax.runs import files, integrity, locks
+from maxent_jax.runs import files, integrity, locks, source
 
 STUDY = "study.json"
 VERSION = 1  # of the layout of a study's directory
 SCALES = ("toy", "cpu", "paper")
 ETAS = (0.1, 0.01, 0.001)
+SCRATCH = "scratch"  # the method that does not explore before a task
+EXPLORED = (0.25, 1.0)  # shares of the iterations of exploration before a task
 
 Changes = dict[str, Any]
 
@@ -28,14 +30,20 @@ class Cell(NamedTuple):
     """One run of a study."""
 
     method: str  # its name in the figures
-    config: Config
+    config: Config  # on a task that starts from another cell, `source` is that cell's name
+    source: "Cell | None" = None
 
     @property
     def name(self) -> str:
         """The name of the cell's directory."""
-        method = "".join(c if c.isalnum() or c in ".-" else "_" for c in self.method)
+        words, task = [self.config.env, self.method], self.config.downstream.task
+        if self.source:
+            words.append(f"{self.config.downstream.source_iterations}")
+        if task != tasks.NONE:
+            words.append(task)
         first, last = self.config.seed, self.config.seed + self.config.num_seeds - 1
-        return f"{self.config.env}-{method}-{first}" + (f"-{last}" if last > first else "")
+        words += [f"{first}"] + ([f"{last}"] if last > first else [])
+        return "-".join(files.as_name(word) for word in words)
 
 
 class Scale(NamedTuple):
@@ -55,6 +63,8 @@ class Study(NamedTuple):
     together: bool = False  # all seeds in one run, instead of one run per seed
     mepol: bool = False  # also runs MEPOL, at the same env steps
     along: str = ""  # the number in which the methods differ: see results.ALONG
+    then: Mapping[str, Sequence[str]] = MappingProxyType({})  # tasks to train on next, by env
+    relabelled: Mapping[str, Sequence[str]] = MappingProxyType({})  # tasks of its data, by env
 
 
 TOY = Scale("smoke", {"pendulum": 2})
@@ -153,6 +163,31 @@ STUDIES: dict[str, Study] = {
         },
         ABLATION,
     ),
+    "downstream": Study(
+        "tasks, after exploring by each method and from scratch",
+        {"V": THREE["V"], **THREE, **{name: {"method": name} for name in ("apt", "rnd", "icm")}},
+        {
+            "toy": TOY,
+            "cpu": Scale("quick", {"ant": 5, "walker2d": 5}, {"policy_lag": 0}),
+            "paper": Scale("paper", dict.fromkeys(MUJOCO_ENVS, 10)),
+        },
+        then={
+            "pendulum": ("gymnasium",),
+            "ant": ("run:0", "run:90", "run:180", "run:270", "goal:15,0", "goal:0,-15"),
+            "walker2d": ("forward", "backward", "flip", "stand"),
+            "humanoid": ("forward", "stand"),
+        },
+    ),
+    "offline": Study(
+        "return of TD3+BC, by what made its dataset",
+        THREE,
+        {
+            "toy": TOY,
+            "cpu": Scale("quick", {"ant": 3}, {"policy_lag": 0}),
+            "paper": Scale("paper", {"ant": 5}),
+        },
+        relabelled={"pendulum": ("gymnasium",), "ant": ("run:0", "reach:10,0", "goal:10,0")},
+    ),
     "baselines": Study(
         "baselines with one policy each, and V",
         {"V": {"method": "v"} | PLAIN, **{name: {"method": name} for name in BASELINES}},
@@ -164,24 +199,60 @@ STUDIES: dict[str, Study] = {
 
 
 def make(study: str, scale: str, num_seeds: int | None = None) -> list[Cell]:
-    """Returns the cells of a study at a scale: all methods of a seed, then the next seed."""
+    """Returns the cells of a study at a scale: all methods of a seed, then the next seed.
+
+    A seed's cells on tasks follow those that they start from.
+    """
     chosen = STUDIES[study]
     at = chosen.scales[scale]
     seeds = at.num_seeds if num_seeds is None else dict.fromkeys(at.num_seeds, num_seeds)
     widths = seeds if chosen.together else dict.fromkeys(seeds, 1)
-    return [
-        Cell(
-            method,
-            preset(
-                at.preset,
-                **{"env": env, "seed": seed, "num_seeds": widths[env], **at.changes, **changes},
-            ),
-        )
-        for seed in range(max(seeds.values()))
-        for env in seeds
-        if seed in range(0, seeds[env], widths[env])
-        for method, changes in chosen.methods.items()
-    ]
+    cells: list[Cell] = []
+    for seed in range(max(seeds.values())):
+        explore = [
+            Cell(
+                method,
+                preset(
+                    at.preset,
+                    **{"env": env, "seed": seed, "num_seeds": widths[env], **at.changes, **changes},
+                ),
+            )
+            for env in seeds
+            if seed in range(0, seeds[env], widths[env])
+            for method, changes in chosen.methods.items()
+        ]
+        cells += [*explore, *_on_tasks(explore, chosen.then)]
+    return cells
+
+
+def _on_tasks(explore: Sequence[Cell], then: Mapping[str, Sequence[str]]) -> Iterator[Cell]:
+    """The cells on tasks that start from each cell, and from scratch."""
+    if not then:
+        return
+    for cell in explore:
+        config, first = cell.config, cell.method == explore[0].method
+        for task in then[config.env]:
+            if first:  # from scratch once, with the settings of the first method
+                yield Cell(SCRATCH, _from_scratch(config, task))
+            for share in EXPLORED:
+                iterations = max(1, round(share * config.budget.num_iterations))
+                own = source.on_task(config, cell.name, task, source_iterations=iterations)
+                yield Cell(cell.method, own, cell)
+
+
+def _from_scratch(explored: Config, task: str) -> Config:
+    """At least as many env steps as a run on the task that starts from policies, which play."""
+    played = source.on_task(explored, "there", task).downstream.first_episodes
+    played *= explored.archive_size * explored.environment.episode_length
+    own = source.on_task(explored, "", task, SCRATCH)
+    more = -(-played // own.budget.steps_per_iteration)
+    return own.replace(num_iterations=own.budget.num_iterations + more)
+
+
+def share(cells: Sequence[Cell], index: int, count: int) -> list[Cell]:
+    """Returns one of `count` shares of the cells; those that start from a cell go where it goes."""
+    own = {cell.name for cell in [c for c in cells if c.source is None][index::count]}
+    return [cell for cell in cells if (cell.source or cell).name in own]
 
 
 def claim(directory: Path, study: str, scale: str, cells: list[Cell]) -> None:
@@ -242,7 +313,7 @@ def home(directory: Path, cell: Cell) -> Path:
     in the same folder, under any name.
     """
     own = directory / cell.name
-    if not own.exists():
+    if not own.exists() and cell.source is None:
         config = files.jsonable(cell.config.flat())
         for study in sorted(directory.parent.glob(f"*/{STUDY}")):
             for name, held in _cells(study).items():
@@ -259,6 +330,18 @@ def _cells(study: Path) -> dict[str, Changes]:
         return {}
 
 
+def config_of(directory: Path, cell: Cell) -> Config:
+    """Returns the config of the cell's run, with the directory of the cell that it starts from."""
+    if cell.source is None:
+        return cell.config
+    begun = home(directory, cell)
+    if integrity.checkpoints(begun):  # wherever the study lay when the run began
+        at = files.read_config(begun).downstream.source
+    else:
+        at = str(home(directory, cell.source))
+    return cell.config.replace(source=at)
+
+
 def finished(directory: Path, cell: Cell) -> bool:
     """Tells whether the cell's run is complete and saved.
 
@@ -268,5 +351,5 @@ def finished(directory: Path, cell: Cell) -> bool:
     at = home(directory, cell)
     if integrity.checkpoints(at)[-1:] != [f"{cell.config.budget.num_iterations}"]:
         return False
-    files.check_config(at, cell.config)
+    files.check_config(at, config_of(directory, cell))
     return True

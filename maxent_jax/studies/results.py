@@ -12,8 +12,10 @@ from maxent_jax.algorithm import methods
 from maxent_jax.config import Config
 from maxent_jax.runs import files, locks
 from maxent_jax.studies import (
+    downstream,
     hazan_weights,
     mepol_values,
+    offline,
     paper_figures,
     protocol,
     statistics,
@@ -57,6 +59,10 @@ def draw(
                 fig3(out / "fig3", scale, num_seeds)
             elif what == "fig5":
                 fig5(out / "fig5", out / "fig4", studies["fig4"])
+            elif protocol.STUDIES[what].then:
+                on_tasks(out / what, what, studies[what])
+            elif protocol.STUDIES[what].relabelled:
+                from_data(out / what, what, scale, studies[what])
             else:
                 study(out / what, what, studies[what])
 
@@ -90,7 +96,7 @@ def study(directory: Path, name: str, cells: Sequence[Cell]) -> None:
         ours = [cell for cell in cells if cell.method == cells[0].method]
         for config in (cell.config for cell in ours):
             rows += mepol_values.rows(directory / config.env, config, config.num_seeds)
-    values.write(directory / "raw.csv", rows)
+    files.write_csv(directory / "raw.csv", values.COLUMNS, rows)
     groups = list(values.groups(rows))
     summary: dict[str, Any] = {
         "study": name,
@@ -108,6 +114,43 @@ def study(directory: Path, name: str, cells: Sequence[Cell]) -> None:
         _print(summary["compared_with"], {f"{env}, {measure}": table[measure] for measure in table})
     if len(summary["versions"]) > 1:
         print(f"note: the runs used {len(summary['versions'])} different sets of versions.")
+    print(f"{directory / 'raw.csv'}, {directory / 'summary.json'}")
+
+
+def on_tasks(directory: Path, name: str, cells: Sequence[Cell]) -> None:
+    """Writes raw.csv, summary.json and the figure of a study of tasks, and prints its table."""
+    rows = downstream.read(directory, cells)
+    files.write_csv(directory / "raw.csv", downstream.COLUMNS, rows)
+    groups = downstream.summarise(rows)
+    versions = _versions(directory, cells)
+    summary = {"study": name, "what": _what(name), "versions": versions, "scores": groups}
+    files.write_json(directory / "summary.json", summary)
+    _save(paper_figures.scores(groups, _what(name)), directory, name)
+    print("score of all tasks: interquartile mean [95 %], optimality gap [95 %], P(V is better)")
+    for row in groups:
+        text = f"  {row['method']:8} {row['explored_steps']:>9,}"
+        for value, ends in (
+            (row["interquartile_mean"], row["interval"]),
+            (row["optimality_gap"], row["gap_interval"]),
+        ):
+            text += f"  {value:5.2f} [{ends[0]:.2f}, {ends[1]:.2f}]"
+        if "probability_of_improvement" in row:
+            low, high = row["probability_interval"]
+            text += f"  {row['probability_of_improvement']:.2f} [{low:.2f}, {high:.2f}]"
+        print(text)
+    print(f"{directory / 'raw.csv'}, {directory / 'summary.json'}")
+
+
+def from_data(directory: Path, name: str, scale: str, cells: Sequence[Cell]) -> None:
+    """Learns from the data of each cell; writes raw.csv, summary.json and the figure."""
+    rows = offline.rows(directory, scale, cells)
+    files.write_csv(directory / "raw.csv", offline.COLUMNS, rows)
+    tables = offline.summarise(rows)
+    versions = _versions(directory, cells)
+    summary = {"study": name, "what": _what(name), "versions": versions, "returns": tables}
+    files.write_json(directory / "summary.json", summary)
+    _save(paper_figures.returns(tables, _what(name)), directory, name)
+    _print("V", tables)
     print(f"{directory / 'raw.csv'}, {directory / 'summary.json'}")
 
 

@@ -1,6 +1,5 @@
 """The raw values of a study's runs: a row for each seed and iteration, and their CSV files."""
 
-import csv
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -48,17 +47,6 @@ def known(row: Row) -> Row:
     """
     own = {name: row[name] for name in COLUMNS if name in row}
     return {name: -math.inf if value is None else value for name, value in own.items()}
-
-
-def write(path: Path, rows: Sequence[Row]) -> None:
-    """Writes a CSV file, completely or not at all."""
-    with (
-        files.whole_file(path) as temporary,
-        open(temporary, "w", encoding="utf-8", newline="") as file,
-    ):
-        writer = csv.DictWriter(file, COLUMNS, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def groups(rows: Sequence[Row]) -> Iterator[tuple[str, str, dict[str, np.ndarray]]]:
