@@ -279,7 +279,7 @@ class Config(_Checked):
     def title(self) -> str:
         """The method for titles, with its bonus if that is set apart from the method."""
         name = f"MaxEnt-{self.method.upper()}" if self.method in ("h", "la", "v") else self.method
-        return name + self.own_bonus
+        return ("SAC" if name == registry.TASK else name) + self.own_bonus
 
     def flat(self) -> dict[str, Any]:
         """Returns every setting by name, without groups. No two groups share a name."""

@@ -125,6 +125,13 @@ def on_tasks(directory: Path, name: str, cells: Sequence[Cell]) -> None:
     versions = _versions(directory, cells)
     summary = {"study": name, "what": _what(name), "versions": versions, "scores": groups}
     files.write_json(directory / "summary.json", summary)
+    known = downstream.scales()
+    tasks = dict.fromkeys((row["env"], row["task"]) for row in rows)
+    if without := [f"{task} ({env})" for env, task in tasks if task not in known.get(env, {})]:
+        print(f"note: without a score, as experts.json has no expert: {', '.join(without)}.")
+    if not groups:
+        print(f"{directory / 'raw.csv'}, {directory / 'summary.json'}")
+        return
     _save(paper_figures.scores(groups, _what(name)), directory, name)
     print("score of all tasks: interquartile mean [95 %], optimality gap [95 %], P(V is better)")
     for row in groups:
