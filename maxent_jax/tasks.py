@@ -44,7 +44,16 @@ class Task(NamedTuple):
         next_observation: jax.Array,
         own: jax.Array,
     ) -> jax.Array:
-        """Rewards transitions [...], whose rewards by the environment itself are `own` [...]."""
+        """Rewards transitions.
+
+        Args:
+          observation: [..., D] the state left.
+          action: [..., A] in [-1, 1].
+          next_observation: [..., D] the state reached.
+          own: [...] what the environment itself paid.
+        Returns:
+          The rewards [...].
+        """
         return own if self.reward is None else self.reward(observation, action, next_observation)
 
 

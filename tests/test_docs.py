@@ -63,7 +63,7 @@ def test_commands_exist_with_their_flags(page):
 
 def flags_of(command):
     fields = [field.name for field in dataclasses.fields(command.Arguments)]
-    names = {name.replace("_", "-") for name in [*fields, *DEFAULTS]} | {"import"}
+    names = {name.replace("_", "-") for name in [*fields, *DEFAULTS]} | {"import", "from"}
     return {f"--{no}{name}" for name in names for no in ("", "no-")} | {"--help", "--help-all"}
 
 

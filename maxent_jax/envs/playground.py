@@ -64,7 +64,7 @@ class PlaygroundEnv(Env):
             return self._as_brax(self._env.reset(rng))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Takes a control step, of several physics steps."""
+        """Takes a control step of several physics steps, with an action [A] in [-1, 1]."""
         kept: Kept = state.pipeline_state
         data = self._blank.replace(
             qpos=kept.qpos,
