@@ -156,7 +156,7 @@ def _play(
 def _groups_side_by_side(x: jax.Array) -> jax.Array:
     """[G, T, E, ...] -> [T, G·E, ...]."""
     x = jnp.swapaxes(x, 0, 1)
-    return x.reshape(x.shape[0], -1, *x.shape[3:])
+    return x.reshape(x.shape[0], x.shape[1] * x.shape[2], *x.shape[3:])  # x may be empty
 
 
 def _restarting(p: Components, episodes: Episodes, found: _Episode, key: jax.Array) -> Episodes:
