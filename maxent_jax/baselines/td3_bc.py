@@ -17,9 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from maxent_jax import rollout
 from maxent_jax.components import Components
+from maxent_jax.mixture import occupancy
 from maxent_jax.precision import in_32_bits
-from maxent_jax.rollout import episodes
 from maxent_jax.sac.networks import Critic, Mlp
 
 UPDATES_AT_ONCE = 1_000  # updates in a call of the program
@@ -140,19 +141,18 @@ def evaluate(
 def _returns(
     p: Components, settings: Settings, num_episodes: int, policy: Policy, key: jax.Array
 ) -> jax.Array:
-    assert p.task is not None
     key_starts, key_play = jax.random.split(key)
     starts = jax.vmap(p.env.reset)(jax.random.split(key_starts, num_episodes))
-    reached = episodes(
+    reached = rollout.episodes(
         p.env,
         starts,
         lambda observation, _: jax.vmap(lambda s: act(p, settings, policy, s))(observation),
         p.config.environment.episode_length,
         key_play,
     )
-    before = jnp.concatenate([starts.obs[None], reached.states[:-1]])
-    paid = p.task.pay(before, reached.actions, reached.states, reached.env.reward)
-    return jnp.sum(jnp.where(reached.alive, paid, 0.0), axis=0)
+    returns = occupancy.task_returns(p, starts, reached)
+    assert returns is not None  # the components have a task
+    return returns
 
 
 def _networks(settings: Settings, action_size: int) -> tuple[Any, Any]:

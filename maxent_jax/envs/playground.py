@@ -29,9 +29,9 @@ class Kept(NamedTuple):
 class PlaygroundEnv(Env):
     """A brax environment for one of Playground's.
 
-    Observations are Playground's, after the position of the body in the plane where it has one: the
-    suite hides it, and no state that differs in nothing else could be told apart. `reward` is that
-    of Playground's task.
+    If the body can move in a plane, its position there comes first in an observation. The suite
+    leaves the position out, and coverage could not be measured without it. The rest is Playground's
+    observation. `reward` is that of Playground's task.
     """
 
     def __init__(self, name: str, backend: str):
@@ -46,12 +46,9 @@ class PlaygroundEnv(Env):
         registry.check_installed(f"{registry.PLAYGROUND}{name}")
         import mujoco_playground
 
-        warp = backend == "warp"
-        self._backend = "warp" if warp else "mjx"
+        self._backend, impl = ("warp", "warp") if backend == "warp" else ("mjx", "jax")
         self._state = mujoco_playground.State
-        self._env = mujoco_playground.dm_control_suite.load(
-            name, config_overrides={"impl": "warp" if warp else "jax"}
-        )
+        self._env = mujoco_playground.dm_control_suite.load(name, config_overrides={"impl": impl})
         self._places = _places(self._env.mj_model)
         with jax.numpy_rank_promotion("allow"):
             blank = jax.jit(self._env.reset)(jax.random.key(0))

@@ -71,7 +71,7 @@ def _explored_steps(cell: Cell) -> int:
     return cell.config.downstream.source_iterations * per_iteration
 
 
-def last_scores(rows: Sequence[Row]) -> dict[tuple[str, int], dict[tuple[str, str], np.ndarray]]:
+def _last_scores(rows: Sequence[Row]) -> dict[tuple[str, int], dict[tuple[str, str], np.ndarray]]:
     """Returns the scores [N] after the last iteration, by method and env steps explored, and task.
 
     Tasks without an expert are left out.
@@ -95,13 +95,9 @@ def optimality_gap(scores: Scores) -> np.ndarray:
     return np.mean(np.maximum(0.0, 1.0 - np.concatenate(scores, axis=-1)), axis=-1)
 
 
-def summarise(rows: Sequence[Row]) -> list[Row]:
-    """Returns, for each method and number of env steps explored, the statistics of all tasks."""
-    return list(_statistics(rows))
-
-
-def _statistics(rows: Sequence[Row]) -> Iterator[Row]:
-    found = last_scores(rows)
+def summarise(rows: Sequence[Row]) -> Iterator[Row]:
+    """Yields, for each method and number of env steps explored, the statistics of all tasks."""
+    found = _last_scores(rows)
     ours = max((group for group in found if group[0] == "V"), default=None)
     for group, by_task in found.items():
         scores = list(by_task.values())

@@ -7,7 +7,7 @@ by the task afterwards. The untrained policy of the first method's runs makes on
 import contextlib
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +32,17 @@ COLUMNS = ("env", "task", "data", "seed", "transitions", "data_reward", "task_re
 Row = dict[str, Any]
 
 
-def rows(directory: Path, scale: str, cells: Sequence[Cell]) -> list[Row]:
-    """Returns a row for each dataset and task: computes those that the study's directory lacks."""
-    tasks = protocol.STUDIES["offline"].relabelled
+def rows(
+    directory: Path, scale: str, cells: Sequence[Cell], tasks: Mapping[str, Sequence[str]]
+) -> list[Row]:
+    """Returns a row for each dataset and task: computes those that the study's directory lacks.
+
+    Args:
+      directory: the study's.
+      scale: one of protocol.SCALES.
+      cells: finished.
+      tasks: names of tasks, by environment.
+    """
     wanted = [
         (cell, data, task)
         for cell in cells

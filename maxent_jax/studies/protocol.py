@@ -227,15 +227,13 @@ def make(study: str, scale: str, num_seeds: int | None = None) -> list[Cell]:
 
 def _on_tasks(explore: Sequence[Cell], then: Mapping[str, Sequence[str]]) -> Iterator[Cell]:
     """The cells on tasks that start from each cell, and from scratch."""
-    if not then:
-        return
     for cell in explore:
         config, first = cell.config, cell.method == explore[0].method
-        for task in then[config.env]:
+        for task in then.get(config.env, ()):
             if first:  # from scratch once, with the settings of the first method
                 yield Cell(SCRATCH, _from_scratch(config, task))
-            for share in EXPLORED:
-                iterations = max(1, round(share * config.budget.num_iterations))
+            for part in EXPLORED:
+                iterations = max(1, round(part * config.budget.num_iterations))
                 own = source.on_task(config, cell.name, task, source_iterations=iterations)
                 yield Cell(cell.method, own, cell)
 

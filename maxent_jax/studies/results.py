@@ -121,13 +121,12 @@ def on_tasks(directory: Path, name: str, cells: Sequence[Cell]) -> None:
     """Writes raw.csv, summary.json and the figure of a study of tasks, and prints its table."""
     rows = downstream.read(directory, cells)
     files.write_csv(directory / "raw.csv", downstream.COLUMNS, rows)
-    groups = downstream.summarise(rows)
+    groups = list(downstream.summarise(rows))
     versions = _versions(directory, cells)
     summary = {"study": name, "what": _what(name), "versions": versions, "scores": groups}
     files.write_json(directory / "summary.json", summary)
-    known = downstream.scales()
-    tasks = dict.fromkeys((row["env"], row["task"]) for row in rows)
-    if without := [f"{task} ({env})" for env, task in tasks if task not in known.get(env, {})]:
+    without = dict.fromkeys(f"{row['task']} ({row['env']})" for row in rows if "score" not in row)
+    if without:
         print(f"note: without a score, as experts.json has no expert: {', '.join(without)}.")
     if not groups:
         print(f"{directory / 'raw.csv'}, {directory / 'summary.json'}")
@@ -150,7 +149,7 @@ def on_tasks(directory: Path, name: str, cells: Sequence[Cell]) -> None:
 
 def from_data(directory: Path, name: str, scale: str, cells: Sequence[Cell]) -> None:
     """Learns from the data of each cell; writes raw.csv, summary.json and the figure."""
-    rows = offline.rows(directory, scale, cells)
+    rows = offline.rows(directory, scale, cells, protocol.STUDIES[name].relabelled)
     files.write_csv(directory / "raw.csv", offline.COLUMNS, rows)
     tables = offline.summarise(rows)
     versions = _versions(directory, cells)
