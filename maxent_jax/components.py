@@ -6,11 +6,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from maxent_jax import envs, intrinsic, tasks
+from maxent_jax import envs, features, intrinsic, tasks
 from maxent_jax.config import Config, registry
 from maxent_jax.config import tasks as task_names
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs.base import Env
+from maxent_jax.envs.skills import WithSkill
 from maxent_jax.envs.task import observation_size
 from maxent_jax.envs.torso import Torso
 from maxent_jax.features import make_feature_map
@@ -48,23 +49,28 @@ def _make(config: Config) -> Components:
         if registry.environment(config.env).is_robot:
             deviations = {name: config[name] for name in envs.DEVIATIONS}
         env = entry.make(config.environment.backend, config.environment.physics, **deviations)
+        phi = make_feature_map(config.env)
+        if config.environment.skill_size:
+            phi = features.of_leading(phi, observation_size(env))
+            env = WithSkill(env, config.environment.skill_size)
         num_dims = num_seen = observation_size(env)
         inputs = lambda observation: observation
         if config.learner.policy_inputs == "heading":
             assert entry.torso is not None  # checked by Config
             inputs, num_seen = entry.torso.heading_inputs, entry.torso.num_seen
         sac = agent.make(config, num_dims, env.action_size, inputs)
-        phi = make_feature_map(config.env)
         bonus = None
         if config.intrinsic.bonus != "none":
-            units = _units(config, entry.grid, len(phi.names))
             bonus = intrinsic.make(
                 config.intrinsic.bonus,
                 len(phi.names),
                 env.action_size,
-                units,
+                _units(config, entry.grid, len(phi.names)),
                 config.learner.learning_rate,
                 entry.grid.num_cells,
+                num_seen - config.environment.skill_size,
+                config.environment.skill_size,
+                config.learner.hidden_size,
             )
         found = Components(config, env, entry.grid, entry.torso, num_seen, sac, phi, bonus)
         return with_task(found, config.downstream.task)

@@ -89,8 +89,9 @@ def make(name: str, env_name: str, env: Env) -> Task:
         return Task(None, task.sparse)
     if env_name not in MUJOCO_ENVS:
         return Task(_CLASSIC[env_name], task.sparse)
-    assert isinstance(env, MujocoEnv)
-    return Task(_FAMILIES[task.family](_ROBOTS[env_name], env, *task.numbers), task.sparse)
+    robot = env.unwrapped
+    assert isinstance(robot, MujocoEnv)
+    return Task(_FAMILIES[task.family](_ROBOTS[env_name], robot, *task.numbers), task.sparse)
 
 
 class _Robot(NamedTuple):

@@ -24,7 +24,7 @@ from maxent_jax.algorithm.training import Learner
 from maxent_jax.components import Components
 from maxent_jax.config import Config
 from maxent_jax.config.registry import CORRECTIVE, STARTS
-from maxent_jax.density import histogram, reservoir
+from maxent_jax.density import histogram, plane, reservoir
 from maxent_jax.envs import base
 from maxent_jax.mixture import Archive, occupancy
 from maxent_jax.precision import in_32_bits
@@ -192,6 +192,7 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
         "mixture_weights": weights,
         "effective_policies": jnp.exp(histogram.shannon_entropy(weights)),
         **coverage("cumulative", learner.visits),
+        **({} if learner.plane is None else {"cells_1m": plane.num_cells(learner.plane)}),
         **(coverage("random", learner.random_visits) if config.evaluation.random_baseline else {}),
         **occupancy.measures(p, visited, key_rows),
     }

@@ -11,7 +11,8 @@ from maxent_jax.algorithm import experience
 from maxent_jax.algorithm.experience import Reference
 from maxent_jax.algorithm.methods import Method
 from maxent_jax.components import Components
-from maxent_jax.density import histogram, reservoir
+from maxent_jax.config import registry
+from maxent_jax.density import histogram, plane, reservoir
 from maxent_jax.density.reservoir import Reservoir
 from maxent_jax.envs import base
 from maxent_jax.envs.base import Episodes
@@ -50,6 +51,7 @@ class Learner(NamedTuple):
     env_steps: jax.Array  # [] int32, of the agent
     gradient_steps: jax.Array  # [] int32
     first_steps: jax.Array | None = None  # [] int32, env steps before training, see finetune
+    plane: jax.Array | None = None  # visited unit cells; None where positions are not metres
 
 
 class Learned(NamedTuple):
@@ -91,6 +93,7 @@ def init(components: Components, key: jax.Array) -> Learner:
         env_steps=zero,
         gradient_steps=zero,
         first_steps=None if components.task is None else zero,
+        plane=plane.empty() if registry.environment(config.env).in_metres else None,
     )
 
 
@@ -246,6 +249,7 @@ def _record(
             components, learner.random_visits, others.next_observation, others.valid
         ),
         env_steps=learner.env_steps + config.budget.num_envs,
+        plane=_visit_plane(components, learner, transition),
     )
     metrics: Metrics = {}
     if components.torso is not None:
@@ -376,6 +380,15 @@ def visit(components: Components, visits: Visits, states: jax.Array, counts: jax
     return Visits(visits.cells + cells, visits.off_grid + jnp.sum(number) - jnp.sum(cells))
 
 
+def _visit_plane(
+    components: Components, learner: Learner, transition: Transition
+) -> jax.Array | None:
+    if learner.plane is None:
+        return None
+    places = histogram.locate(transition.next_observation, components.grid)
+    return plane.visit(learner.plane, places, transition.valid)
+
+
 def _draw(components: Components, learner: Learner, key: jax.Array) -> Experience:
     """Draws the batches of one vector step, [updates, B]."""
     config = components.config
@@ -433,7 +446,7 @@ def _paid_by_bonus(
 ) -> tuple[Any, jax.Array, Metrics]:
     """The bonus after learning from the draw, its reward before learning [..., 1], and metrics."""
     # It sees features, as every other reward does. Its reward is divided by the standard deviation
-    # over the draw: methods prescribe no scale, but SAC's temperature needs one.
+    # over the draw: most methods prescribe no scale, but SAC's temperature needs one.
     payer = components.bonus
     assert payer is not None
     key_value, key_learn = jax.random.split(key)
@@ -446,11 +459,13 @@ def _paid_by_bonus(
         episodic=outcomes.bonus[..., 0],
         row=drawn.row,
         cell=_cells(components, drawn.next_observation),
+        **_states(components, drawn),
     )
     together = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps)
     bonus, found = payer.reward(learner.bonus, together)
     size = jnp.std(found)
-    paid = components.config.intrinsic.reward_scale * found / jnp.maximum(size, SMALLEST_SIZE)
+    unit = 1.0 if payer.has_scale else jnp.maximum(size, SMALLEST_SIZE)
+    paid = components.config.intrinsic.reward_scale * found / unit
 
     def learn(bonus, batch_and_key):
         return payer.learn(bonus, *batch_and_key)
@@ -459,6 +474,18 @@ def _paid_by_bonus(
     bonus, metrics = jax.lax.scan(learn, bonus, (steps, keys))
     paid = paid.reshape(*steps.value.shape, 1) + _for_living(components, outcomes)
     return bonus, paid, metrics | {"bonus_size": size}
+
+
+def _states(components: Components, drawn: Experience) -> dict[str, jax.Array]:
+    """Before and after the step, what the networks see; and the skill, apart."""
+    size = components.config.environment.skill_size
+    if not size:
+        return {}
+    return {
+        "state": drawn.observation[..., :-size],
+        "next_state": drawn.next_observation[..., :-size],
+        "skill": drawn.observation[..., -size:],
+    }
 
 
 def _cells(components: Components, states: jax.Array) -> jax.Array:

@@ -220,6 +220,11 @@ def _to_minari(run: Run, directory: Path) -> Writer:
     name = run.config.env
     if name not in MUJOCO_ENVS:
         raise UsageError(f"format minari holds {', '.join(MUJOCO_ENVS)}, but the run is on {name}.")
+    if run.config.environment.skill_size:
+        raise UsageError(
+            "format minari holds Gymnasium's observations, but the run's end with a skill: choose "
+            "npz or exorl."
+        )
     identifier = f"maxent/{name}/{files.read_id(run.path)}-v0"
     env = envs.make(name, "mujoco", torque_limit=run.config.environment.torque_limit)
     assert isinstance(env, MujocoEnv)

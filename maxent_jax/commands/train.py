@@ -113,7 +113,7 @@ def check_arguments(arguments: Arguments) -> None:
 
 def _default_config(argv: Sequence[str]) -> Config:
     """The config that flags change: a preset, or that of the run to resume."""
-    decisive = ("preset", "env", "method", "task")
+    decisive = ("preset", "env", "method", "protocol", "task")
     values = {name: cli.flag_value(argv, f"--{name}") for name in decisive}
     given = {name: value for name, value in values.items() if value}
     out = cli.flag_value(argv, "--out")

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from maxent_jax.config.registry import CLASSIC_ENVS
+from maxent_jax.config.registry import CLASSIC_ENVS, METRA, MUJOCO_ENVS
 
 _FAST_LEARNER: dict[str, Any] = dict(
     critic_layer_norm=True,
@@ -104,6 +104,19 @@ _BUDGETS = {
     "humanoid": dict(num_iterations=4, updates_per_step=0.25, random_baseline=False, **_LONG),
 }
 
+# What a protocol changes in every preset. The length of METRA's episodes leaves fewer states.
+PROTOCOLS: dict[str, dict[str, Any]] = {
+    "own": {},
+    "metra": dict(
+        episode_length=200,
+        end_unhealthy=False,
+        end_flipped=False,
+        mixture_episodes=48,
+        reference_size=8192,
+        deterministic=True,
+    ),
+}
+
 # What a preset changes in some environments.
 IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
     **{("quick", env): changes | _BUDGETS.get(env, {}) for env, changes in _ROBOTS.items()},
@@ -125,7 +138,19 @@ IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
 }
 
 # What a method changes in some environments, by preset. If V on Walker2d starts from the best
-# policy, it only walks in that policy's direction (docs/results/learning.md).
+# policy, it only walks in that policy's direction (docs/results/learning.md). METRA's settings are
+# its authors'.
 OF_METHOD_IN_ENV: dict[tuple[str, str, str], dict[str, Any]] = {
-    (preset, "walker2d", "v"): dict(start="scratch") for preset in ("quick", "gpu")
+    **{(preset, "walker2d", "v"): dict(start="scratch") for preset in ("quick", "gpu")},
+    **{
+        (preset, env, METRA): dict(
+            updates_per_step=1 / 32,
+            hidden_size=1024,
+            learning_rate=1e-4,
+            batch_size=256,
+            replay_size=1_000_000,
+        )
+        for preset in ("quick", "gpu", "paper")
+        for env in MUJOCO_ENVS
+    },
 }

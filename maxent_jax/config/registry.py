@@ -96,6 +96,7 @@ _BY_PREFIX = {
 }
 _USERS = EnvironmentRow(backends=BACKENDS, physics=PHYSICS)
 
+METRA = "metra"
 BONUSES = {
     "rnd": _bonus("rnd"),
     "icm": _bonus("icm"),
@@ -107,6 +108,7 @@ BONUSES = {
     "kmeans": _bonus("kmeans"),
     "apt": _bonus("apt", 12),
     "histogram": _bonus("histogram", baseline=False),
+    METRA: _bonus("metra"),
 }
 
 # The learner's settings in methods as published by their authors, and in the baselines.
@@ -117,6 +119,27 @@ _AS_PUBLISHED = PLAIN | {"episodic_weight": 0.0, "reward_scale": 1.0}
 
 def _baseline(bonus: str) -> MethodRow:
     return MethodRow("last", 0, "mixture", "last", _AS_PUBLISHED | {"bonus": bonus})
+
+
+def _metra() -> MethodRow:
+    """Its authors' settings that do not depend on the budget."""
+    own = {
+        "skill_size": 2,
+        "normalize_inputs": True,
+        "policy_inputs": "state",
+        "yaw_copies": 0,
+        "alive_bonus": 0.0,
+        "torque_limit": 1.0,
+        "restart_temperature": False,
+        "lagrangian_entropy": False,
+        "critic_layer_norm": False,
+        "actor_average": 0.0,
+        "snapshots": 1,
+        "initial_temperature": 0.01,
+        "target_entropy_scale": 0.5,
+    }
+    row = _baseline(METRA)
+    return row._replace(settings={**row.settings, **own})
 
 
 TASK = "task"  # the method that is paid by a task alone
@@ -130,6 +153,7 @@ METHODS = {
         _AS_PUBLISHED | {"bonus": "histogram", "mixing": "step", "leave_own_out": False},
     ),
     **{name: _baseline(name) for name, row in BONUSES.items() if row.baseline},
+    METRA: _metra(),
     TASK: MethodRow(
         *("last", 0, "history", "last"),
         dict(

@@ -60,6 +60,9 @@ class Environment(_Checked):
     """End an episode when the robot is upside down; departs from the paper."""
     end_unhealthy: bool = True
     """End an episode when the robot's health fails (health termination)."""
+    skill_size: int = 0
+    """Z: entries of the skill that each episode is given, a random unit vector that the networks
+    see; 0: none."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -224,6 +227,9 @@ class Config(_Checked):
     task (one policy, paid by --task alone)."""
     preset: str = "quick"
     """Defaults of the other flags: smoke, quick, gpu or paper (docs/concepts/presets.md)."""
+    protocol: str = "own"
+    """own, or metra: episodes of 200 steps that health does not end, and 48 deterministic ones to
+    evaluate, as METRA and its successors are compared (docs/results/rivals.md)."""
     seed: int = 0
     """Seed of everything random except the feature projection."""
     num_seeds: int = 1
@@ -334,7 +340,7 @@ DEFAULTS: dict[str, Any] = {
 }
 """The value of each setting in `Config()`."""
 DATA_FIELDS = (
-    *("method", "preset", "seed", "num_seeds"),
+    *("method", "preset", "protocol", "seed", "num_seeds"),
     *("weights", "eta", "reference", "refresh_period", "start"),
     *("plateau_segments", "plateau_tolerance"),
     *("source", "source_seed", "source_iterations", "start_from", "first_episodes"),
@@ -373,8 +379,9 @@ def preset(name: str, **changes: Any) -> Config:
     in_env = presets.IN_ENV.get((name, env), {})
     of_method = registry.method(method).settings
     of_both = presets.OF_METHOD_IN_ENV.get((name, env, method), {})
+    of_protocol = validation.protocol(changes.get("protocol", Config.protocol), env)
     of_task = tasks.settings(changes.get("task", tasks.NONE), env)
-    settings = {**presets.PRESETS[name], **in_env, **of_method, **of_both, **of_task}
+    settings = {**presets.PRESETS[name], **in_env, **of_method, **of_both, **of_protocol, **of_task}
     return from_flat({"preset": name, **settings, **changes})
 
 

@@ -12,6 +12,7 @@ from maxent_jax.errors import ConfigError, ConfigTypeError
 _CHOICES = {
     "mixing": names.MIXINGS,
     "preset": presets.PRESETS,
+    "protocol": presets.PROTOCOLS,
     "reward": names.REWARDS,
     "policy_inputs": names.INPUTS,
     "shaping_space": names.SPACES,
@@ -42,7 +43,7 @@ _NOT_NEGATIVE = (
     *("alive_bonus", "actor_average"),
     *("intrinsic_weight", "intrinsic_decay", "source_seed", "source_iterations"),
     *("critic_steps", "restart_share"),
-    *("yaw_copies", "discount", "target_entropy_scale", "policy_lag"),
+    *("yaw_copies", "discount", "target_entropy_scale", "policy_lag", "skill_size"),
 )
 
 
@@ -105,6 +106,21 @@ def check(env: str, method: str, settings: Mapping[str, Any]) -> None:
     if settings["task"] != tasks.NONE:
         tasks.parse(settings["task"], env)
     _check_together(SimpleNamespace(**settings), row)
+
+
+def protocol(name: str, env: str) -> Mapping[str, Any]:
+    """Returns the settings of a protocol.
+
+    Raises:
+      ConfigError: the protocol is unknown, or not for this environment.
+    """
+    check_choice("protocol", name, presets.PROTOCOLS)
+    settings = presets.PROTOCOLS[name]
+    if settings and not registry.environment(env).is_robot:
+        raise ConfigError(
+            f"protocol is {name}, but {env} has none: choose {', '.join(registry.MUJOCO_ENVS)}."
+        )
+    return settings
 
 
 def check_physics(env: str, backend: str, physics: str) -> None:
@@ -175,6 +191,15 @@ def _check_together(c: SimpleNamespace, row: EnvironmentRow) -> None:
         (
             c.yaw_copies and not row.has_torso,
             f"yaw-copies is {c.yaw_copies}, but must be 0: {c.env} cannot turn about the vertical.",
+        ),
+        (
+            c.skill_size and (c.policy_inputs != "state" or c.yaw_copies),
+            f"skill-size is {c.skill_size}, but needs policy-inputs state and yaw-copies 0: a "
+            f"skill does not turn with the state.",
+        ),
+        (
+            c.bonus == registry.METRA and not c.skill_size,
+            f"bonus is {c.bonus}, which rewards skills: skill-size must be at least 1.",
         ),
         (
             2 * c.plateau_segments > c.num_segments,

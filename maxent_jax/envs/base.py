@@ -114,7 +114,7 @@ def step_beside(
     Returns:
       The episodes after the step, the transitions [N, ...], and the result of `work`.
     """
-    if isinstance(env, MujocoEnv):
+    if isinstance(env.unwrapped, MujocoEnv):
         after, result = env.step_beside(episodes.env, action, work, key_work)
     else:
         after, (result, _) = jax.vmap(env.step)(episodes.env, action), work(key_work)

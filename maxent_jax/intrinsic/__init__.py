@@ -7,7 +7,7 @@ import jax
 from maxent_jax.config import registry
 from maxent_jax.config.registry import BonusRow, resolve
 from maxent_jax.errors import ConfigTypeError
-from maxent_jax.intrinsic.protocol import Bonus, Episodic, Setting, Steps
+from maxent_jax.intrinsic.protocol import HIDDEN_SIZE, Bonus, Episodic, Setting, Steps
 
 __all__ = ["Bonus", "Episodic", "Setting", "Steps", "make", "register"]
 
@@ -36,6 +36,9 @@ def make(
     scale: jax.Array,
     learning_rate: float,
     num_cells: int,
+    state_size: int = 0,
+    skill_size: int = 0,
+    hidden_size: int = HIDDEN_SIZE,
 ) -> Bonus:
     """Makes the bonus of a name.
 
@@ -46,6 +49,9 @@ def make(
       scale: [D] positive, the unit of each entry: networks and distances see observation / scale.
       learning_rate: of Adam, if the bonus learns by gradients.
       num_cells: of the grid on which coverage is counted.
+      state_size: I, of what the networks see without the skill.
+      skill_size: Z.
+      hidden_size: of the actor and the critics.
     Raises:
       ValueError: the name is unknown, or the scale is not [D].
     """
@@ -53,5 +59,8 @@ def make(
     if scale.shape != (observation_size,):
         raise ValueError(f"scale has shape {scale.shape}, but must be ({observation_size},)")
     return resolve(row.make)(
-        Setting(observation_size, action_size, scale, learning_rate, num_cells)
+        Setting(
+            *(observation_size, action_size, scale, learning_rate, num_cells),
+            *(state_size, skill_size, hidden_size),
+        )
     )

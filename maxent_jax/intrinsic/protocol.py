@@ -34,6 +34,9 @@ class Steps(NamedTuple):
     episodic: jax.Array  # [B] from Episodic.novelty when the step was taken; 0 without it
     row: jax.Array  # [B] int32, equal for copies of one transition that was drawn more than once
     cell: jax.Array | None = None  # [B] int32 of the grid, where the step arrived; num_cells off it
+    state: jax.Array | None = None  # [B, I] what the networks see, without the skill
+    next_state: jax.Array | None = None  # [B, I]
+    skill: jax.Array | None = None  # [B, Z]
 
 
 class Episodic(NamedTuple):
@@ -62,6 +65,8 @@ class Bonus(NamedTuple):
     refresh: Callable[[State, jax.Array], State] | None = None
     """state, share [bins, bins] of the mixture's states in each cell -> state; called when an
     iteration begins"""
+    has_scale: bool = False
+    """The reward keeps its size; without, it is divided by its standard deviation"""
 
 
 class Setting(NamedTuple):
@@ -72,6 +77,9 @@ class Setting(NamedTuple):
     scale: jax.Array  # [D] the unit of each entry of an observation
     learning_rate: float
     num_cells: int  # of the grid on which coverage is counted
+    state_size: int = 0  # of what the networks see, without the skill
+    skill_size: int = 0
+    hidden_size: int = HIDDEN_SIZE  # of the actor and the critics
 
 
 def scaled(setting: Setting, observation: jax.Array) -> jax.Array:

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 
 from maxent_jax import mixture, rewards, rollout
 from maxent_jax.components import Components
+from maxent_jax.config import registry
 from maxent_jax.config.registry import CORRECTIVE
-from maxent_jax.density import entropy, histogram
+from maxent_jax.density import entropy, histogram, plane
 from maxent_jax.density.knn import NONE_EXCLUDED, knn_distances
 from maxent_jax.envs.base import State
 from maxent_jax.mixture import Archive
@@ -277,8 +278,17 @@ def measures(components: Components, occupancy: Occupancy, key: jax.Array) -> Me
             sample, config.intrinsic.num_neighbors, labels=rows
         ),
         "evaluation_episode_length": jnp.sum(occupancy.alive) / occupancy.episode_policy.shape[0],
+        **_unit_cells(components, occupancy),
         **_task_measures(components, occupancy),
     }
+
+
+def _unit_cells(components: Components, occupancy: Occupancy) -> Metrics:
+    if not registry.environment(components.config.env).in_metres:
+        return {}
+    places = histogram.locate(occupancy.states, components.grid)
+    visited = plane.visit(plane.empty(), places, occupancy.weight > 0)
+    return {"mixture_cells_1m": plane.num_cells(visited)}
 
 
 def _task_measures(components: Components, occupancy: Occupancy) -> Metrics:

@@ -13,7 +13,7 @@ import math
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +32,7 @@ from maxent_jax.errors import CheckpointError, SaveError
 from maxent_jax.mixture import Archive
 from maxent_jax.runs import files, integrity
 from maxent_jax.runs.integrity import ARRAYS, FOLDER, UNFINISHED
+from maxent_jax.runs.progress import say
 from maxent_jax.sac.agent import Parameters
 
 CHECKPOINTS_KEPT = 2
@@ -122,12 +123,10 @@ def restore(run_directory: Path, name: str, config: Config, placed: State | None
     """
     shapes = _shapes(config)
     wanted = _items(_abstract(shapes, placed))
-    if older := not _holds_tasks(run_directory, name):
-        wanted["rest"] = _less(wanted["rest"])
+    held = _held(run_directory, name)
+    wanted["rest"] = _less(wanted["rest"], held)
     items = _load(run_directory, name, wanted)
-    results, rest = items["results"], items["rest"]
-    if older:
-        rest = _more(rest)
+    results, rest = items["results"], _more(items["rest"], shapes, placed)
     learner = rest.learner._replace(visits=results.visits, random_visits=results.random_visits)
     return _as_computed(rest._replace(archive=results.archive, learner=learner), shapes, placed)
 
@@ -149,29 +148,41 @@ def restore_results(run_directory: Path, name: str, config: Config) -> Results:
     return found._replace(archive=found.archive._replace(parameters=parameters))
 
 
-def _holds_tasks(run_directory: Path, name: str) -> bool:
-    """Whether the checkpoint was written since there are tasks: it then holds their fields."""
+def _held(run_directory: Path, name: str) -> Mapping[str, Any]:
+    """The fields of the learner that the checkpoint holds; older ones lack those added since."""
     path = (run_directory / FOLDER / name / ARRAYS).absolute()
-    return "first_steps" in ocp.checkpointables_metadata(path).metadata["rest"]["learner"]
+    return ocp.checkpointables_metadata(path).metadata["rest"]["learner"]
 
 
-def _less(rest: State) -> State:
-    """Without the fields of tasks, which are None: Orbax insists on their presence."""
-    learner: Any = rest.learner._asdict()
-    episodes, items = learner["episodes"]._asdict(), learner["replay"].items._asdict()
-    del learner["first_steps"], episodes["restarts"], items["task"]
-    learner |= {"episodes": episodes, "replay": learner["replay"]._replace(items=items)}
-    return rest._replace(learner=learner)
+def _less(rest: State, held: Mapping[str, Any]) -> State:
+    """Without the fields that the checkpoint lacks: Orbax insists on the presence of all."""
+
+    def kept(fields: Any, those: Mapping[str, Any]) -> Any:
+        return {name: x for name, x in fields._asdict().items() if name in those}
+
+    learner = rest.learner
+    learner = learner._replace(
+        episodes=kept(learner.episodes, held["episodes"]),
+        replay=learner.replay._replace(
+            items=kept(learner.replay.items, held["replay"]["items"]),
+        ),
+    )
+    return rest._replace(learner=kept(learner, held))
 
 
-def _more(rest: State) -> State:
-    """The state of which `_less` gave a part."""
+def _more(rest: State, shapes: State, placed: State | None) -> State:
+    """The state of which `_less` gave a part; a checkpoint without a plane begins an empty one."""
     learner: Any = rest.learner
     replay = learner["replay"]
     found = {
         "episodes": Episodes(**learner["episodes"]),
         "replay": replay._replace(items=Step(**replay.items)),
     }
+    plane = shapes.learner.plane
+    if plane is not None and learner.get("plane") is None:
+        say("note: an older release began this run: cells_1m counts from here on.")
+        device = None if placed is None else placed.learner.plane
+        found["plane"] = jnp.zeros(plane.shape, plane.dtype, device=device)
     return rest._replace(learner=Learner(**{**learner, **found}))
 
 

@@ -13,6 +13,9 @@ from maxent_jax.config import registry
 from maxent_jax.density import histogram
 from maxent_jax.visual import plotting
 
+EPISODES = 5  # of each policy
+EPISODES_WITH_SKILLS = 16  # of each policy, so that the newest one shows skills all around
+
 
 def draw_missing(directory: Path) -> None:
     """Rolls out the archived policies and draws the figures of a run, unless they exist.
@@ -41,6 +44,7 @@ def draw_missing(directory: Path) -> None:
 def _draw(directory: Path, modules: Sequence[str] = ()) -> None:
     registry.import_modules(modules)
     run = load_run(directory)
-    visited = run.occupancy()
+    has_skills = run.config.environment.skill_size > 0
+    visited = run.occupancy(EPISODES_WITH_SKILLS if has_skills else EPISODES)
     cells = histogram.count(visited.states, run.components.grid, visited.weight)
     plotting.save_all(run, np.asarray(cells), paths(visited))

@@ -137,10 +137,17 @@ def occupancy_map(run: Run, mixture_cells: np.ndarray) -> Figure:
 
 
 def fireworks(run: Run, paths: Paths) -> Figure:
-    """Draws the paths of each policy's episodes, one colour per policy."""
+    """Draws the paths of each policy's episodes; with skills, those of the newest by its skills."""
     figure = Figure(figsize=(7.4, 6.6), layout="constrained")
     ax = figure.subplots()
     draw_paths(ax, run, paths)
+    if run.config.environment.skill_size:
+        for degrees in range(0, 360, 90):
+            color = _skill_color(np.radians(degrees))
+            ax.plot([], [], color=color, label=f"skill at {degrees}°")
+        ax.set_title("paths of the newest policy by skill; dots mark their ends")
+        ax.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
+        return _finish(figure, run)
     for policy, color in enumerate(policy_colors(run.num_policies)):
         ax.plot([], [], color=color, label=f"π{policy}" + (" (untrained)" if policy == 0 else ""))
     ax.set_title("paths of the archived policies; dots mark their ends")
@@ -169,12 +176,21 @@ def draw_occupancy(
 
 
 def draw_paths(ax: Axes, run: Run, paths: Paths) -> None:
-    """Draws the paths of each policy's episodes, and the edge of the grid."""
+    """Draws the paths of each policy's episodes, and the edge of the grid.
+
+    With skills, only the newest policy's, each in the colour of its skill.
+    """
     colors = policy_colors(run.num_policies)
+    skills = run.config.environment.skill_size
     for states, alive, policy in zip(*paths, strict=True):
+        color = colors[policy]
+        if skills:
+            if policy < run.num_policies - 1:
+                continue
+            color = _skill_color(np.arctan2(states[0, -1], states[0, -skills]))
         xy = np.asarray(histogram.locate(states[alive], run.components.grid))
-        ax.plot(*xy.T, color=colors[policy], lw=0.9, alpha=0.8)
-        ax.plot(*xy[-1:].T, "o", color=colors[policy], ms=3)
+        ax.plot(*xy.T, color=color, lw=0.9, alpha=0.8)
+        ax.plot(*xy[-1:].T, "o", color=color, ms=3)
     _name_axes(ax, run)
     low_x, high_x, low_y, high_y = _extent(run)
     ax.plot(
@@ -193,6 +209,11 @@ def policy_colors(num_policies: int) -> np.ndarray:
     """Returns [P, 4] RGBA in [0, 1]: black for the untrained policy, then from blue to red."""
     trained = matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, max(num_policies - 1, 1)))
     return np.concatenate([[[0, 0, 0, 1]], trained])[:num_policies]
+
+
+def _skill_color(angle: float) -> np.ndarray:
+    """The colour of a skill by its direction, in radians, on a circle."""
+    return matplotlib.colormaps["hsv"](angle / (2 * np.pi) % 1.0)
 
 
 def save_all(run: Run, mixture_cells: np.ndarray, paths: Paths) -> None:

@@ -69,7 +69,7 @@ def scene(components: Components, size: int) -> Scene:
     Raises:
       RenderingError: it is not MuJoCo's, does not observe positions, or this machine cannot draw.
     """
-    env = components.env
+    env = components.env.unwrapped
     if not isinstance(env, MujocoEnv) or env.observation_size < env.model.nq:
         raise RenderingError(
             f"environment '{components.config.env}' cannot be drawn: its observation does not "
