@@ -10,7 +10,7 @@ from scipy.special import digamma
 
 from maxent_jax import intrinsic, moments
 from maxent_jax.config.registry import BONUSES
-from maxent_jax.intrinsic import Setting, Steps, kmeans, ngu, particles, rise, vcse
+from maxent_jax.intrinsic import Setting, Steps, kmeans, metra, ngu, particles, rise, vcse
 
 D, A, B = 3, 2, 24
 SCALE = np.array([0.5, 2.0, 10.0], np.float32)
@@ -36,7 +36,10 @@ def steps(before, action, after, value=0.0, episodic=1.0):
     size = len(after)
     columns = (before, action, after, np.broadcast_to(value, size), np.full(size, episodic))
     row = np.arange(size, dtype=np.int32)
-    return Steps(*(np.asarray(column, np.float32) for column in columns), row, row % (CELLS + 1))
+    columns = [np.asarray(column, np.float32) for column in columns]
+    angle = np.random.default_rng(size).uniform(0, 2 * np.pi, size)
+    skill = np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
+    return Steps(*columns, row, row % (CELLS + 1), columns[0], columns[2], skill)
 
 
 def arriving(after):
@@ -83,7 +86,7 @@ def nearest(points, k):
 
 @functools.cache
 def made(name):
-    bonus = intrinsic.make(name, D, A, jnp.asarray(SCALE), RATE, CELLS)
+    bonus = intrinsic.make(name, D, A, jnp.asarray(SCALE), RATE, CELLS, D, 2)
 
     def step(state, batch, key):
         state, reward = bonus.reward(state, batch)
@@ -641,6 +644,57 @@ def test_kmeans_pays_for_leaving_the_crowd():
         state, _, _ = step(state, arriving(crowd), jax.random.key(seed))
     pays = lambda states: np.asarray(step(state, arriving(states), KEY)[1])
     assert pays(crowd + 4 * SCALE).min() > 5 * np.abs(pays(crowd)).max()  # measured: 9 to 27
+
+
+# METRA.
+
+
+def test_metra_pays_the_step_along_the_skill_in_its_space():
+    bonus, init, step = made("metra")
+    batch = steps_of(3)
+    state, paid, _ = step(init(KEY), batch, KEY)
+    phi = init(KEY).learned.parameters.phi  # before learning
+    met = np.float64(batch.next_state)
+    units = lambda states: (states - met.mean(0)) / met.std(0)
+    moved = mlp(phi, units(met)) - mlp(phi, units(np.float64(batch.state)))
+    # The prior of the moments weighs 1e-4 of 24.
+    np.testing.assert_allclose(paid, (moved * batch.skill).sum(1), rtol=1e-3, atol=1e-4)
+    assert bonus.has_scale
+    with pytest.raises(ValueError, match="the steps have none"):
+        bonus.reward(state, batch._replace(skill=None))
+
+
+def test_metra_measures_its_first_states_and_no_more():
+    bonus, init, _ = made("metra")
+    state, batch = init(KEY), steps_of(size=4000)
+    for seen in (4000, 8000, 12000, 12000, 12000):
+        state, _ = bonus.reward(state, batch)
+        np.testing.assert_allclose(state.inputs.weight, seen, rtol=1e-6)
+
+
+def test_metra_learns_the_axes_along_which_skills_move_and_steps_of_at_most_1():
+    # Two entries of the state move along the skill, by 0.1; the third at random, by 10 times that.
+    rng = np.random.default_rng(0)
+    _, init, step = made("metra")
+
+    def batch(seed):
+        base = steps_of(seed, size=256)
+        moved = np.concatenate([0.1 * base.skill, rng.normal(size=(256, 1))], axis=1)
+        return base._replace(next_state=np.float32(base.state + moved))
+
+    state, first, _ = step(init(KEY), batch(0), KEY)
+    for seed in range(600):
+        state, paid, _ = step(state, batch(seed), KEY)
+    phi = state.learned.parameters.phi
+    moved = metra.displacement(metra.build(setting_with_skills()), state, phi, batch(1))
+    # The constraint: a mean square of 1 in each of two dimensions, so a length of √2 along z.
+    assert np.abs(np.mean(first)) < 0.2
+    assert 1.0 < np.mean(paid) < 1.5
+    assert 0.8 < np.mean(moved**2) < 1.3
+
+
+def setting_with_skills():
+    return setting()._replace(state_size=D, skill_size=2)
 
 
 def test_the_published_reward_of_h_by_hand():

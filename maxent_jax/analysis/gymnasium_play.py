@@ -21,8 +21,9 @@ NUM_SETS = 5  # sets of episodes in our simulator, which differ by chance alone
 class RunTask(gymnasium.Wrapper):
     """Gymnasium's environment with the actions and states of a run's policies.
 
-    Actions in [-1, 1] span the run's share of the control range, and states are float32. An episode
-    also ends upside down if the run's do. Starts, physics, health and reward are Gymnasium's.
+    Actions in [-1, 1] span the run's share of the control range, and states are float32, followed
+    by the episode's skill if the run has skills. An episode also ends upside down if the run's do.
+    Starts, physics, health and reward are Gymnasium's.
     """
 
     def __init__(self, env: gymnasium.Env, config: Config):
@@ -37,22 +38,31 @@ class RunTask(gymnasium.Wrapper):
             torso = components.make(config).torso
             assert torso is not None  # checked by MujocoEnv
             self._ended = jax.jit(torso.flipped)
+        self._skill = np.zeros(config.environment.skill_size, np.float32)
         self.action_space = gymnasium.spaces.Box(-1, 1, low.shape)
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, env.observation_space.shape)
+        assert env.observation_space.shape is not None
+        size = env.observation_space.shape[0] + self._skill.size
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Resets Gymnasium's environment; returns the state [D] and its info."""
         observation, info = self.env.reset(seed=seed, options=options)
-        return observation.astype(np.float32), info
+        if self._skill.size:
+            direction = self.env.unwrapped.np_random.normal(size=self._skill.size)
+            self._skill = np.asarray(direction / np.linalg.norm(direction), np.float32)
+        return self._state(observation), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Takes one control step with the action [A] in [-1, 1]; returns the state [D] first."""
         control = self._control_center + self._control_span * np.clip(np.float64(action), -1, 1)
         observation, reward, terminated, truncated, info = self.env.step(control)
-        state = observation.astype(np.float32)
+        state = self._state(observation)
         return state, float(reward), bool(terminated or self._ended(state)), truncated, info
+
+    def _state(self, observation: np.ndarray) -> np.ndarray:
+        return np.concatenate([observation.astype(np.float32), self._skill])
 
 
 class Gap(NamedTuple):

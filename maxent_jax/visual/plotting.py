@@ -212,8 +212,8 @@ def policy_colors(num_policies: int) -> np.ndarray:
 
 
 def _skill_color(angle: float) -> np.ndarray:
-    """The colour of a skill by its direction, in radians, on a circle."""
-    return matplotlib.colormaps["hsv"](angle / (2 * np.pi) % 1.0)
+    """RGBA [4] of a skill by its direction, in radians, on a circle."""
+    return np.array(matplotlib.colormaps["hsv"](angle / (2 * np.pi) % 1.0))
 
 
 def save_all(run: Run, mixture_cells: np.ndarray, paths: Paths) -> None:
