@@ -31,6 +31,13 @@ QUANTITIES = (
     ("mixture_coverage", "cells, mixture"),
     ("mixture_entropy", "entropy, mixture (nats)"),
 )
+UNIT_CELLS = (
+    ("cells_1m", "unit cells, training so far"),
+    ("mixture_cells_1m", "unit cells, 48 episodes"),
+)
+# Training on Ant for 12 hours on a GPU, read off the figure of TLDR (Bae et al. 2024, arXiv
+# 2407.08464).
+PUBLISHED = {"TLDR": 24_000, "METRA": 19_500, "PEG": 2_300}
 COLORS = {"V": "#d1495b", "LA": "#edae49", "H": "#1b6ca8", RANDOM: "#7a7a7a"}
 OTHERS = ("#4c956c", "#9a7aa0", "#2f3e46", "#5fa8d3", "#b5651d", "#e07a9f", "#8a9a5b", "#003049")
 
@@ -77,7 +84,11 @@ def classic_weights(found: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]])
     return figure
 
 
-def curves(groups: Sequence[tuple[str, str, Columns]], title: str) -> Figure:
+def curves(
+    groups: Sequence[tuple[str, str, Columns]],
+    title: str,
+    quantities: Sequence[tuple[str, str]] = QUANTITIES,
+) -> Figure:
     """Draws Fig. 4: interquartile means with their intervals.
 
     One environment has a row for each quantity and a column for each axis. Several environments are
@@ -86,9 +97,9 @@ def curves(groups: Sequence[tuple[str, str, Columns]], title: str) -> Figure:
     envs = list(dict.fromkeys(env for env, _, _ in groups))
     several = len(envs) > 1
     if several:
-        panels = [[(env, *quantity, ENV_STEPS) for quantity in QUANTITIES] for env in envs]
+        panels = [[(env, *quantity, ENV_STEPS) for quantity in quantities] for env in envs]
     else:
-        panels = [[(envs[0], *quantity, axis) for axis in AXES] for quantity in QUANTITIES]
+        panels = [[(envs[0], *quantity, axis) for axis in AXES] for quantity in quantities]
     figure = Figure(figsize=(13, 2.7 * len(panels)), layout="constrained")
     share: Literal["none", "row"] = "none" if several else "row"
     axes = figure.subplots(len(panels), len(panels[0]), sharey=share, squeeze=False)
@@ -97,7 +108,7 @@ def curves(groups: Sequence[tuple[str, str, Columns]], title: str) -> Figure:
     bands = {
         (env, method, name): interval_of_curves(columns[name])
         for env, method, columns in groups
-        for name, _ in QUANTITIES
+        for name, _ in quantities
         if name in columns
     }
     for ax, (env, name, _, axis) in zip(axes.flat, chain(*panels), strict=True):
@@ -105,7 +116,10 @@ def curves(groups: Sequence[tuple[str, str, Columns]], title: str) -> Figure:
             if at == env and name in columns:
                 band = bands[env, method, name]
                 _draw(ax, columns, band, axis, opacity, label=method, **styles[method])
-        ax.set_ylim(bottom=0)
+        if (env, name) == ("ant", "cells_1m"):
+            _draw_published(ax)
+        else:
+            ax.set_ylim(bottom=0)
     for ax, (_, _, _, axis) in zip(axes[-1], panels[-1], strict=True):
         ax.set_xlabel(axis[1])
     for ax, ((env, _, label, _), *_) in zip(axes[:, 0], panels, strict=True):
@@ -270,6 +284,14 @@ def _draw(ax: Axes, columns: Columns, band: Band, axis: Axis, opacity: float, **
     x = columns[quantity].mean(0) * factor
     ax.plot(x, middle, marker="o", ms=3, **style)
     ax.fill_between(x, low, high, color=style["color"], alpha=opacity, lw=0)
+
+
+def _draw_published(ax: Axes) -> None:
+    """What others reach in 12 hours on a GPU, on a logarithmic scale."""
+    for name, cells in PUBLISHED.items():
+        ax.axhline(cells, ls=":", lw=1, color=COLORS[RANDOM])
+        ax.annotate(f"{name}, 12 h", (0.02, cells), xycoords=ax.get_yaxis_transform(), fontsize=7)
+    ax.set_yscale("log")
 
 
 def _band(

@@ -163,6 +163,20 @@ STUDIES: dict[str, Study] = {
         },
         ABLATION,
     ),
+    "rivals": Study(
+        "unit cells under METRA's protocol",
+        {
+            "V": {"method": "v", "torque_limit": 1.0},
+            "METRA": {"method": "metra"},
+            "APT": {"method": "apt", "torque_limit": 1.0},
+            "RND": {"method": "rnd", "torque_limit": 1.0},
+        },
+        {
+            "toy": TOY._replace(num_seeds={"ant": 2}, changes={"protocol": "metra"}),
+            "cpu": Scale("quick", {"ant": 3}, {"protocol": "metra", "policy_lag": 0}),
+            "paper": Scale("paper", {"ant": 5, "humanoid": 5}, {"protocol": "metra"}),
+        },
+    ),
     "downstream": Study(
         "tasks, after exploring by each method and from scratch",
         {"V": THREE["V"], **THREE, **{name: {"method": name} for name in ("apt", "rnd", "icm")}},

@@ -28,6 +28,7 @@ FIG2_TIMES = (5, 10, 20)
 SUMMARISED = (
     *("cumulative_coverage", "cumulative_entropy"),
     *("mixture_coverage", "mixture_entropy", "mixture_knn_entropy"),
+    *("cells_1m", "mixture_cells_1m"),
 )
 
 # Numbers in which a study's methods may differ: the name in the figure, and the value.
@@ -105,7 +106,9 @@ def study(directory: Path, name: str, cells: Sequence[Cell]) -> None:
         **summarise(groups),
     }
     files.write_json(directory / "summary.json", summary)
-    _save(paper_figures.curves(groups, _what(name)), directory, name)
+    rivals = cells[0].config.protocol == "metra"
+    quantities = paper_figures.UNIT_CELLS if rivals else paper_figures.QUANTITIES
+    _save(paper_figures.curves(groups, _what(name), quantities), directory, name)
     if field := protocol.STUDIES[name].along:
         label, value = ALONG[field]
         places = {(cell.config.env, cell.method): value(cell.config) for cell in cells}
@@ -180,6 +183,8 @@ def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[
     envs = sorted({env for env, _, _ in groups})
     names = list(dict.fromkeys(method for _, method, _ in groups))
     ours = "V" if "V" in names else names[0]
+    of_ours = [columns for _, method, columns in groups if method == ours]
+    measured = [name for name in SUMMARISED if all(name in columns for columns in of_ours)]
     last = {
         env: {
             name: {
@@ -187,7 +192,7 @@ def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[
                 for at, method, columns in groups
                 if at == env and name in columns
             }
-            for name in SUMMARISED
+            for name in measured
         }
         for env in envs
     }
@@ -200,7 +205,7 @@ def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[
             },
             ours,
         )
-        for name in (SUMMARISED if len(envs) > 1 else ())
+        for name in (measured if len(envs) > 1 else ())
     }
     return {
         "compared_with": ours,

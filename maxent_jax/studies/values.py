@@ -17,6 +17,7 @@ COLUMNS = (
     *(f"cumulative_{name}" for name in MEASURED),
     *(f"mixture_{name}" for name in (*MEASURED, "knn_entropy")),
     *("effective_policies", "evaluation_episode_length", "num_rollout_steps"),
+    *("cells_1m", "mixture_cells_1m"),
 )
 RANDOM = "random policy"
 
