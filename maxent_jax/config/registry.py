@@ -106,6 +106,7 @@ BONUSES = {
     "vcse": _bonus("vcse", 12),
     "kmeans": _bonus("kmeans"),
     "apt": _bonus("apt", 12),
+    "proto": _bonus("proto"),
     "histogram": _bonus("histogram", baseline=False),
 }
 
