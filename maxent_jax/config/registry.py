@@ -107,6 +107,7 @@ BONUSES = {
     "kmeans": _bonus("kmeans"),
     "apt": _bonus("apt", 12),
     "proto": _bonus("proto"),
+    "giril": _bonus("giril"),
     "histogram": _bonus("histogram", baseline=False),
 }
 
