@@ -107,6 +107,8 @@ BONUSES = {
     "vcse": _bonus("vcse", 12),
     "kmeans": _bonus("kmeans"),
     "apt": _bonus("apt", 12),
+    "proto": _bonus("proto"),
+    "giril": _bonus("giril"),
     "histogram": _bonus("histogram", baseline=False),
     METRA: _bonus("metra"),
 }

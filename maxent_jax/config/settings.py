@@ -91,7 +91,7 @@ class Intrinsic(_Checked):
     """λ: weight of the episodic term; 0: none."""
     bonus: str = "none"
     """Bonus that replaces the distance to the reference: none, rnd, icm, ngu,
-    re3, rise, renyi, vcse, kmeans, apt, histogram, or user:NAME."""
+    re3, rise, renyi, vcse, kmeans, apt, proto, giril, metra, histogram, or user:NAME."""
 
 
 @dataclasses.dataclass(frozen=True)
