@@ -179,7 +179,11 @@ STUDIES: dict[str, Study] = {
     ),
     "downstream": Study(
         "tasks, after exploring by each method and from scratch",
-        {"V": THREE["V"], **THREE, **{name: {"method": name} for name in ("apt", "rnd", "icm", "proto")}},
+        {
+            "V": THREE["V"],
+            **THREE,
+            **{name: {"method": name} for name in ("apt", "rnd", "icm", "proto")},
+        },
         {
             "toy": TOY,
             "cpu": Scale("quick", {"ant": 5, "walker2d": 5}, {"policy_lag": 0}),
