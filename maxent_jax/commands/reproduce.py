@@ -23,7 +23,7 @@ from maxent_jax.checks import check_choice
 from maxent_jax.commands import cli, train
 from maxent_jax.runs import locks, runtime
 from maxent_jax.runs.claim import Claim
-from maxent_jax.runs.signals import heeded
+from maxent_jax.runs.signals import Interrupted, heeded
 from maxent_jax.studies import protocol
 from maxent_jax.studies.protocol import Cell
 from maxent_jax.visual import headless
@@ -36,6 +36,7 @@ FIGURES: dict[str, tuple[str, ...]] = {
     "fig4": ("fig4",),
     "fig5": ("fig4",),
 }
+POLL_SECONDS = 60  # NFS may show a directory as it was that long ago
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,11 +125,12 @@ def _check(arguments: Arguments) -> tuple[int, int]:
 def _train(directory: Path, cells: Sequence[Cell]) -> int:
     """Trains the unfinished cells that no other process trains; returns how many failed.
 
-    Cells that start from another one wait until that is finished.
+    Cells that start from another one wait until that is finished, by this process or another. A
+    cell whose process dies meanwhile is resumed.
     """
-    failures, left, trained = 0, cells, True
-    while trained:
-        now, left, trained = left, [], False
+    failures, left = 0, cells
+    while True:
+        now, left, busy, trained = left, [], [], False
         for cell in now:
             try:
                 if cell.source and not protocol.finished(directory, cell.source):
@@ -136,11 +138,15 @@ def _train(directory: Path, cells: Sequence[Cell]) -> int:
                 else:
                     trained |= _train_cell(directory, cell)
             except locks.BusyError:
-                continue
+                busy.append(cell)
             except (errors.RunError, errors.NonFiniteError) as error:
                 print(f"error: {error} Continuing with the next cell.", file=sys.stderr)
                 failures += 1
-    return failures
+        if not trained:
+            if not any(cell.source in busy for cell in left):
+                return failures
+            time.sleep(POLL_SECONDS)
+        left += busy
 
 
 def _train_cell(directory: Path, cell: Cell) -> bool:
@@ -153,7 +159,9 @@ def _train_cell(directory: Path, cell: Cell) -> bool:
     with Claim(at, config, resume=True).hold():
         from maxent_jax.runs import driver  # loads jax
 
-        train.run_to_end(config, at, started, driver.Options(fallback=True))
+        received = train.run_to_end(config, at, started, driver.Options(fallback=True))
+    if received is not None:
+        raise Interrupted(received, at)
     return True
 
 
