@@ -17,9 +17,9 @@ with Interruption() as interruption:
 """
 
 
-def busy(*before):
+def busy(*before, code=BUSY):
     process = subprocess.Popen(
-        [*before, sys.executable, "-c", BUSY],
+        [*before, sys.executable, "-c", code],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -62,3 +62,15 @@ def test_a_signal_is_remembered_where_nobody_reads_the_messages():
     with process:
         assert process.stdout.read() == f"{int(signal.SIGHUP)}\n"
     assert process.returncode == 0
+
+
+def test_a_user_signal_is_remembered_if_the_program_has_a_handler_for_it():
+    had = "import signal\nsignal.signal(signal.SIGUSR2, lambda *_: print('requeued', flush=True))"
+    process = busy(code=f"{had}\n{BUSY}\nsignal.raise_signal(interruption.received)")
+    process.send_signal(signal.SIGUSR2)
+    out, _ = process.communicate()
+    assert process.returncode == 0 and out == f"{int(signal.SIGUSR2)}\nrequeued\n"
+    process = busy()
+    process.send_signal(signal.SIGUSR2)
+    process.communicate()
+    assert process.returncode == -signal.SIGUSR2

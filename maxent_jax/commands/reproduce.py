@@ -2,31 +2,36 @@
 
 A study's directory holds study.json, a run for each cell and, once all cells are finished, raw.csv,
 summary.json and the figure. A study that was stopped and is started again resumes the unfinished
-cells. Several processes can share a directory; machines without a shared disk can share the cells.
+cells. Several processes, or jobs of a SLURM cluster, can share a directory; machines without a
+shared disk can share the cells.
 """
 
 import dataclasses
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from maxent_jax import errors
 from maxent_jax.checks import check_choice
-from maxent_jax.commands import cli, train
-from maxent_jax.runs import locks, runtime
+from maxent_jax.commands import cli, launcher, train
+from maxent_jax.runs import files, locks, runtime
 from maxent_jax.runs.claim import Claim
-from maxent_jax.runs.signals import heeded
+from maxent_jax.runs.signals import Interrupted, heeded
 from maxent_jax.studies import protocol
 from maxent_jax.studies.protocol import Cell
 from maxent_jax.visual import headless
+
+if TYPE_CHECKING:
+    import submitit
 
 # The studies from which each figure of the paper is made. The other half of Fig. 3, weights on Ant,
 # is the study `weights`: on a CPU it takes longer than all the others.
@@ -36,6 +41,8 @@ FIGURES: dict[str, tuple[str, ...]] = {
     "fig4": ("fig4",),
     "fig5": ("fig4",),
 }
+POLL_SECONDS = 60  # NFS may show a directory as it was that long ago
+JOBS = "jobs"  # in --out: what submitit writes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,12 +64,21 @@ class Arguments:
     arrays."""
     figures: bool = True
     """Draw the figures once all cells are finished."""
+    launcher: str = "local"
+    """local (train here), or submitit (submit jobs to a SLURM cluster; needs the extra slurm)."""
+    num_workers: int = 1
+    """Jobs of --launcher submitit, which share the cells."""
+    slurm: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE")] = ()
+    """Settings of sbatch for each job: time=MINUTES, partition, cpus_per_task, gpus_per_node, mem,
+    account, ..."""
 
 
 def main(argv: Sequence[str]) -> None:
     """Parses and checks the arguments, and only then trains."""
     arguments = cli.parse(Arguments, argv, "reproduce")
     index, count = _check(arguments)
+    submits = arguments.launcher == "submitit"
+    executor = launcher.slurm(arguments.out / JOBS, arguments.slurm) if submits else None
     whats = tuple(FIGURES) if arguments.what == "all" else (arguments.what,)
     names = dict.fromkeys(name for what in whats for name in FIGURES.get(what, (what,)))
     studies = {name: protocol.make(name, arguments.scale, arguments.seeds) for name in names}
@@ -77,6 +93,9 @@ def main(argv: Sequence[str]) -> None:
     for what in whats:
         with locks.holding(arguments.out / what):  # fails here rather than after hours of work
             pass
+    if executor is not None:
+        _submit(arguments, executor, studies)
+        return
     if studies and arguments.jobs > 1:
         _share(arguments)
     else:
@@ -86,12 +105,7 @@ def main(argv: Sequence[str]) -> None:
         )
         if failures:
             sys.exit(1)
-    left = [
-        f"{name}/{cell.name}"
-        for name, cells in studies.items()
-        for cell in cells
-        if not protocol.finished(arguments.out / name, cell)
-    ]
+    left = _unfinished(arguments.out, studies)
     if left and arguments.figures:
         print(f"no figures yet: {len(left)} cells are not finished, the first is {left[0]}.")
     elif arguments.figures:
@@ -109,6 +123,7 @@ def _check(arguments: Arguments) -> tuple[int, int]:
         raise errors.UsageError(f"seeds is {arguments.seeds}, but a study needs at least 1.")
     if arguments.jobs < 1:
         raise errors.UsageError(f"jobs is {arguments.jobs}, but must be at least 1.")
+    _check_launcher(arguments)
     shard = re.fullmatch(r"([0-9]+)/([0-9]+)", arguments.shard)
     if shard is None or int(shard[1]) >= int(shard[2]):
         raise errors.UsageError(f"shard is {arguments.shard}, but must be I/N with 0 <= I < N.")
@@ -121,14 +136,40 @@ def _check(arguments: Arguments) -> tuple[int, int]:
     return int(shard[1]), int(shard[2])
 
 
+def _check_launcher(arguments: Arguments) -> None:
+    check_choice("launcher", arguments.launcher, ("local", "submitit"))
+    if arguments.num_workers < 1:
+        raise errors.UsageError(f"num-workers is {arguments.num_workers}, but must be at least 1.")
+    if arguments.launcher == "local":
+        if arguments.num_workers > 1 or arguments.slurm:
+            raise errors.UsageError("num-workers and slurm are for --launcher submitit: add it.")
+    elif arguments.jobs > 1:
+        raise errors.UsageError(
+            "jobs is for the cores of this machine: leave it out, or leave out --launcher."
+        )
+    elif FIGURES.get(arguments.what) == ():
+        raise errors.UsageError(f"{arguments.what} has no cells to share: leave out --launcher.")
+
+
+def _unfinished(out: Path, studies: Mapping[str, Sequence[Cell]]) -> list[str]:
+    """The names of the cells that are not finished."""
+    return [
+        f"{name}/{cell.name}"
+        for name, cells in studies.items()
+        for cell in cells
+        if not protocol.finished(out / name, cell)
+    ]
+
+
 def _train(directory: Path, cells: Sequence[Cell]) -> int:
     """Trains the unfinished cells that no other process trains; returns how many failed.
 
-    Cells that start from another one wait until that is finished.
+    Cells that start from another one wait until that is finished, by this process or another. A
+    cell whose process dies meanwhile is resumed.
     """
-    failures, left, trained = 0, cells, True
-    while trained:
-        now, left, trained = left, [], False
+    failures, left = 0, cells
+    while True:
+        now, left, busy, trained = left, [], [], False
         for cell in now:
             try:
                 if cell.source and not protocol.finished(directory, cell.source):
@@ -136,11 +177,15 @@ def _train(directory: Path, cells: Sequence[Cell]) -> int:
                 else:
                     trained |= _train_cell(directory, cell)
             except locks.BusyError:
-                continue
+                busy.append(cell)
             except (errors.RunError, errors.NonFiniteError) as error:
                 print(f"error: {error} Continuing with the next cell.", file=sys.stderr)
                 failures += 1
-    return failures
+        if not trained:
+            if not any(cell.source in busy for cell in left):
+                return failures
+            time.sleep(POLL_SECONDS)
+        left += busy
 
 
 def _train_cell(directory: Path, cell: Cell) -> bool:
@@ -153,16 +198,53 @@ def _train_cell(directory: Path, cell: Cell) -> bool:
     with Claim(at, config, resume=True).hold():
         from maxent_jax.runs import driver  # loads jax
 
-        train.run_to_end(config, at, started, driver.Options(fallback=True))
+        received = train.run_to_end(config, at, started, driver.Options(fallback=True))
+    if received is not None:
+        raise Interrupted(received, at)
     return True
+
+
+def _worker(arguments: Arguments) -> list[str]:
+    """The arguments of a process that trains its part of the cells and draws nothing."""
+    return [arguments.what, "--no-figures", *_given(arguments, "scale", "out", "seeds", "shard")]
+
+
+def _given(arguments: Arguments, *names: str) -> list[str]:
+    values = {name: getattr(arguments, name) for name in names}
+    return [
+        word
+        for name, value in values.items()
+        if value is not None
+        for word in (f"--{name}", str(value))
+    ]
+
+
+def _submit(
+    arguments: Arguments,
+    executor: "submitit.SlurmExecutor",
+    studies: Mapping[str, Sequence[Cell]],
+) -> None:
+    """Submits the workers; prints where their logs are, and what a user can type next."""
+    total, left = sum(map(len, studies.values())), len(_unfinished(arguments.out, studies))
+    here = [arguments.what, *_given(arguments, "scale", "out", "seeds")]
+    draw = f"{cli.spelled('reproduce')} {shlex.join(here)}"
+    if not left:
+        print(f"all {total} cells are finished, so no job is submitted. The figures: {draw}")
+        return
+    jobs = launcher.submit(executor, _worker(arguments), arguments.num_workers)
+    job = jobs[0].job_id.split("_")[0]
+    rows = [f"{shlex.quote(str(arguments.out / name))}/*/{files.METRICS}" for name in studies]
+    print(f"submitted job {job}: {arguments.num_workers} workers for {left} of {total} cells")
+    print(f"logs: {arguments.out / JOBS}/{job}_*.out")
+    print("next:")
+    print(f"  squeue --jobs {job}")
+    print(f"  wc -l {' '.join(rows)}  # iterations of each cell")
+    print(f"  {draw}  # the figures, once all cells are finished")
 
 
 def _share(arguments: Arguments) -> None:
     """Runs the jobs as processes, each on its share of the cores; passes signals on to them."""
-    command = [sys.executable, "-m", "maxent_jax", "reproduce", arguments.what, "--no-figures"]
-    for name in ("scale", "out", "seeds", "shard"):
-        value = getattr(arguments, name)
-        command += [] if value is None else [f"--{name}", str(value)]
+    command = [sys.executable, "-m", "maxent_jax", "reproduce", *_worker(arguments)]
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     processes: list[subprocess.Popen[bytes]] = []
 

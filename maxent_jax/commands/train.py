@@ -253,14 +253,15 @@ def train(config: Config, out: str | Path, resume: bool = False, overwrite: bool
     return load_run(directory)
 
 
-def run_to_end(config: Config, directory: Path, started: float, options: "Options") -> None:
+def run_to_end(config: Config, directory: Path, started: float, options: "Options") -> int | None:
     """Trains the rest of the run and draws its figures; see `driver.train`."""
     from maxent_jax.runs import driver, hosts  # loads jax
     from maxent_jax.visual import figures
 
-    driver.train(config, directory, started, options)
+    received = driver.train(config, directory, started, options)
     if hosts.is_first():
         figures.draw_missing(directory)
+    return received
 
 
 def _print_figures(directory: Path) -> None:

@@ -47,12 +47,14 @@ def check(config: Config, options: Options = AS_USUAL) -> None:
 
 def train(
     config: Config, directory: Path, process_started: float, options: Options = AS_USUAL
-) -> None:
+) -> int | None:
     """Trains a run to its end, from its last checkpoint if there is one.
 
     Args:
       directory: an existing directory, empty or with this run in it.
       process_started: time.perf_counter() when the program began, for the time to the first step.
+    Returns:
+      The signal that arrived in the last iteration, too late to stop the run; None without one.
     Raises:
       UsageError, ConfigError: see `check`.
       CheckpointCorruptError: the last checkpoint is damaged.
@@ -69,7 +71,7 @@ def train(
         hosts.leave()
         if hosts.is_first():
             print(f"{directory} is complete: nothing to train.")
-        return
+        return None
     if hosts.is_first():
         announce(config, directory, 0 if progress is None else len(progress.rows))
     if progress is None:
@@ -77,10 +79,11 @@ def train(
     else:
         stage = Stage(checkpoint.restore(directory, progress.name, config, placed), progress)
     programs = algorithm.programs(config) if placed is None else devices.programs(config, placed)
-    rows = _train(config, directory, programs, stage, process_started, options)
+    rows, received = _train(config, directory, programs, stage, process_started, options)
     hosts.leave()
     if hosts.is_first():
         _summarise(config, directory, rows)
+    return received
 
 
 def _chosen(num_devices: int) -> list[jax.Device]:
@@ -167,8 +170,8 @@ def _train(
     stage: Stage,
     process_started: float,
     options: Options,
-) -> list[dict[str, Any]]:
-    """Trains the remaining iterations; returns the rows of all iterations."""
+) -> tuple[list[dict[str, Any]], int | None]:
+    """Trains the remaining iterations; returns the rows of all iterations, and `train`'s signal."""
     state, progress = stage
     done = len(progress.rows)
     clock = Clock(process_started, progress.clock)
@@ -201,7 +204,7 @@ def _train(
                 clock.saved(saved_at)
             if received and done < config.budget.num_iterations:
                 raise Interrupted(received, directory)
-    return progress.rows
+    return progress.rows, interruption.received
 
 
 def _summarise(config: Config, directory: Path, rows: list[dict[str, Any]]) -> None:

@@ -1,8 +1,8 @@
-"""Lets a run save itself at SIGINT, SIGTERM or SIGHUP; a second Ctrl-C ends it at once.
+"""Lets a run save itself when a signal arrives; a second Ctrl-C ends it at once.
 
-SIGHUP is sent when a terminal closes. Python runs a signal handler between two of its own
-instructions, and a compiled program can take minutes. So a thread reads the signal from a pipe,
-whatever the main thread does.
+SIGHUP is sent when a terminal closes. A cluster sends SIGUSR1 or SIGUSR2 before a job's time ends.
+Python runs a signal handler between two of its own instructions, and a compiled program can take
+minutes. So a thread reads the signal from a pipe, whatever the main thread does.
 """
 
 import contextlib
@@ -13,16 +13,18 @@ import sys
 import threading
 from pathlib import Path
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, *((signal.SIGHUP,) if hasattr(signal, "SIGHUP") else ()))
-
 
 def heeded() -> tuple[signal.Signals, ...]:
-    """Returns the signals that this process handles; under nohup, SIGHUP stays ignored."""
-    return tuple(
-        number
-        for number in SIGNALS
-        if number in SIGNALS[:2] or signal.getsignal(number) != signal.SIG_IGN
-    )
+    """Returns the signals that save a run: SIGINT, SIGTERM, and others that depend on the process.
+
+    SIGHUP is included unless it is ignored, as under nohup. SIGUSR1 and SIGUSR2 are included if the
+    process has a handler for them, as a job of submitit has.
+    """
+    found = [signal.SIGINT, signal.SIGTERM]
+    if hasattr(signal, "SIGHUP"):  # POSIX
+        found += [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN else []
+        found += [n for n in (signal.SIGUSR1, signal.SIGUSR2) if callable(signal.getsignal(n))]
+    return tuple(found)
 
 
 class Interrupted(Exception):
@@ -30,6 +32,7 @@ class Interrupted(Exception):
 
     def __init__(self, received: int, directory: Path):
         """Takes the number of the signal, and the directory in which the run is saved."""
+        self.received = received
         self.exit_code = 128 + received
         name = signal.Signals(received).name
         super().__init__(
@@ -64,7 +67,7 @@ class Interruption:
     def _watch(self) -> None:
         while received := self._reading.recv(1):
             number = received[0]
-            if number not in SIGNALS:
+            if number not in self._handlers:
                 continue
             if self.received is None:
                 self.received = number
