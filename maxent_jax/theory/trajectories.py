@@ -22,11 +22,14 @@ TOLERANCE = 1e-6  # nats, of the largest entropy of the mean
 
 
 def known(toy: bool) -> dict[str, Mdp]:
-    """Returns MDPs with few histories by name; the chain and the grid are deterministic."""
+    """Returns MDPs with few histories by name; the chain and the grid are deterministic.
+
+    The chain is that of the official code of ηψ-learning: 6 states, from the third, 20 steps.
+    """
     if toy:
         return {"chain": mdps.finite_horizon(mdps.double_chain(4, failure=0), 4)}
     return {
-        "chain": mdps.finite_horizon(mdps.double_chain(6, failure=0), 12),
+        "chain": mdps.finite_horizon(mdps.double_chain(6, failure=0), 20),
         "grid": mdps.finite_horizon(mdps.open_grid(3, success=1), 9),
         "slippery grid": mdps.finite_horizon(mdps.open_grid(3, success=0.9), 9),
         "river swim": mdps.finite_horizon(mdps.river_swim(), 12),
@@ -37,7 +40,7 @@ def known(toy: bool) -> dict[str, Mdp]:
 def compare(
     mdp: Mdp, iterations: int, settings: eta_psi.Settings, keys: jax.Array
 ) -> dict[str, Any]:
-    """Compares policies of an MDP of finite horizon; each of the keys gives a run of learning."""
+    """Compares policies of an MDP of finite horizon; each of the keys [K] is a run of learning."""
     listed = histories.enumerate_all(mdp)
     states, actions = mdp.successors.shape[:2]
     uniform = np.full((len(mdp.discount), states, actions), 1 / actions)
