@@ -44,7 +44,7 @@ def greedy_policy(histories: Histories, psi: np.ndarray) -> np.ndarray:
 
 
 def fixed_point(histories: Histories) -> np.ndarray:
-    """Returns ψ [X, A, S] to which learning converges, by backward induction."""
+    """Returns the fixed point of learning, ψ [X, A, S], by backward induction."""
     num_actions, num_states = histories.following.shape[1], histories.counts.shape[1]
     psi = np.zeros((len(histories.state), num_actions, num_states))
     still = np.eye(num_states)[histories.state]  # visits from now on under the greedy policy
