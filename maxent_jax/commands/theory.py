@@ -1,6 +1,7 @@
 """Compares MaxEnt-H, LA and V with their bounds and the exact optimum, in tabular MDPs.
 
-Prints tables, and writes the results as JSON and the figures as PNG.
+Prints tables, and writes the results as JSON and the figures as PNG. `theory trajectories` is
+another study: see commands/trajectories.py.
 """
 
 import dataclasses
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from maxent_jax import errors
-from maxent_jax.commands import cli
+from maxent_jax.commands import cli, trajectories
 from maxent_jax.runs import files, progress, runtime
 from maxent_jax.visual import headless
 
@@ -24,7 +25,10 @@ SAMPLES, TOY_SAMPLES = (1_000, 10_000, 100_000), (500, 1_000)
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """Compare the methods with their bounds and the exact optimum, in tabular MDPs."""
+    """Compare the methods with their bounds and the exact optimum, in tabular MDPs.
+
+    `theory trajectories` compares mixtures with policies that see the episode; see its --help.
+    """
 
     out: Path = Path("theory.json")
     """File for the results, JSON."""
@@ -50,6 +54,9 @@ class Arguments:
 
 def main(argv: Sequence[str]) -> None:
     """Parses and checks the arguments, and only then computes."""
+    if list(argv[:1]) == ["trajectories"]:
+        trajectories.main(argv[1:])
+        return
     arguments = _check(cli.parse(Arguments, argv, "theory"))
     headless.draw_nothing()
     runtime.start(simulates_in_jax=False)
