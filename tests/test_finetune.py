@@ -154,6 +154,12 @@ def test_first_episodes_begin_at_starts_and_not_where_restarts_will_be():
     np.testing.assert_allclose(items.state[begins], left + moved, atol=1e-6)
 
 
+def test_a_run_on_a_task_does_not_restart_at_the_cells_of_its_source():
+    explored = preset("smoke", env="ant", cell_restarts=0.9)
+    config = source.on_task(explored, "there", "forward")
+    assert config.environment.cell_restarts == 0 and config.downstream.restart_share == 0.5
+
+
 def test_only_critics_learn_at_first():
     config = task_config(start_from="last", critic_steps=200)  # a segment of two
     state, _ = finetune.start(config, archive_of(config, [0.1]))
