@@ -55,8 +55,9 @@ class StopAt(Interruption):
         dict(method="la", refresh_period=10),
         dict(normalize_inputs=True, actor_average=0.01, snapshots=2),
         dict(env="ant", normalize_inputs=True, policy_lag=1),
+        dict(episode_length=20, reference_size=128, cell_restarts=0.9),
     ],
-    ids=["h", "la", "v", "lag"],
+    ids=["h", "la", "v", "lag", "cells"],
 )
 def test_a_run_stopped_anywhere_ends_as_one_that_was_not(tmp_path, monkeypatch, changes):
     config = preset("smoke", **{"env": "pendulum", "num_seeds": 2, **changes})

@@ -200,3 +200,125 @@ def test_other_restarts_take_the_place_of_the_first(episodes, key):
         episodes = base.with_restarts(episodes, states, restarts)
         assert episodes.starts.done.shape == (68,)
     assert len(np.unique(base.only_starts(episodes).obs)) == 64
+
+
+NUM_CELLS = 6  # of the line, from 0 to 6
+
+
+def in_cells(share, key, starts=64):
+    """Episodes on the line that restart at its cells of length 1."""
+    episodes = base.init(LINE, N, starts, key)
+    return base.with_cells(episodes, NUM_CELLS, jnp.broadcast_to(share, (N,)))
+
+
+def fill(episodes):
+    x = episodes.env.obs[:, 0]
+    inside = (x >= 0) & (x < NUM_CELLS)
+    cell = jnp.where(inside, jnp.floor(x), NUM_CELLS).astype(jnp.int32)
+    return jax.jit(base.fill_cells)(episodes, cell)
+
+
+def at(episodes, *x):
+    """The episodes, moved to these places."""
+    return episodes._replace(env=episodes.env.replace(obs=jnp.array(x, jnp.float32)[:, None]))
+
+
+def stored(episodes):
+    return np.asarray(episodes.starts.obs[-NUM_CELLS:, 0])
+
+
+def test_a_cell_keeps_the_first_state_from_which_an_episode_goes_on(key):
+    episodes = in_cells(0.5, key)
+    assert not episodes.restarts.visits.any()
+    episodes = fill(at(episodes._replace(age=jnp.array([3, 1, 2])), 1.5, 1.25, 2.5))
+    episodes = fill(at(episodes._replace(age=jnp.array([9, 8, 7])), 1.75, 4.5, 2.25))
+    episodes = fill(at(episodes, -3.0, jnp.nan, 6.5))  # off the grid
+    np.testing.assert_array_equal(episodes.restarts.visits, [0, 3, 2, 0, 1, 0])
+    np.testing.assert_array_equal(stored(episodes)[[1, 2, 4]], [1.5, 2.5, 4.5])
+    np.testing.assert_array_equal(episodes.restarts.age, [0, 3, 2, 0, 8, 0])
+    assert base.only_starts(episodes).done.shape == (64,)
+    assert np.isin(stored(episodes)[[0, 3, 5]], episodes.starts.obs[:64, 0]).all()
+
+
+def test_every_entry_of_a_stored_state_is_of_one_episode(key):
+    episodes = in_cells(1.0, key)
+    moved = at(episodes, 3.1, 3.2, 3.3)
+    moved = moved._replace(env=moved.env.replace(pipeline_state=jnp.array([31.0, 32.0, 33.0])))
+    after = fill(moved._replace(age=jnp.array([1, 2, 3])))
+    row = jax.tree.map(lambda x: x[64 + 3], after.starts)
+    first = jax.tree.map(lambda x: x[0], moved.env)
+    assert all(jax.tree.leaves(jax.tree.map(jnp.array_equal, row, first)))
+    assert (row.obs[0], row.pipeline_state) == (jnp.float32(3.1), 31.0)
+    assert after.restarts.age[3] == 1 and after.restarts.visits[3] == 3
+
+
+def test_neither_a_terminal_nor_an_invalid_nor_a_last_state_is_stored(key):
+    episodes = at(in_cells(1e-9, key), 2.0, 2.0, 2.0)
+    for move, limit in (((3.5, 3.5, 3.5), LIMIT), ((-8, -8, -8), LIMIT), ((1, 1, 1), 1)):
+        after, transition = step(episodes, act(*move), key, limit)
+        assert (transition.terminated | transition.truncated).all()
+        np.testing.assert_array_equal(np.flatnonzero(fill(after).restarts.visits), [0])
+    after, _ = step(episodes, act(1, 1, 1), key)
+    np.testing.assert_array_equal(np.flatnonzero(fill(after).restarts.visits), [3])
+
+
+def test_an_episode_without_a_share_neither_restarts_nor_fills(key):
+    episodes = in_cells(jnp.array([1.0, 1.0, 0.0]), key)
+    episodes = fill(at(episodes, 1.5, 2.5, 3.5))
+    np.testing.assert_array_equal(episodes.restarts.visits, [0, 1, 1, 0, 0, 0])
+    for key_step in jax.random.split(key, 20):
+        begun = base.begin_again(episodes, key_step)
+        assert (np.asarray(begun.start) >= 64).tolist() == [True, True, False]
+
+
+def test_without_a_visited_cell_all_episodes_begin_at_starts(key):
+    episodes = in_cells(1.0, key)
+    begun = base.begin_again(episodes, key)
+    assert (begun.start < 64).all() and (begun.age == 0).all() and is_start(begun, slice(None))
+
+
+def test_a_share_of_the_episodes_begins_at_stored_states_of_their_age(key):
+    many = 400
+    episodes = base.with_cells(base.init(LINE, many, 64, key), NUM_CELLS, jnp.full(many, 0.5))
+    x = jnp.linspace(1.0, 4.9, many)
+    moved = episodes._replace(
+        env=episodes.env.replace(obs=x[:, None], pipeline_state=jnp.arange(400.0)),
+        age=jnp.arange(many, dtype=jnp.int32),
+    )
+    cell = jnp.floor(x).astype(jnp.int32)
+    episodes = base.fill_cells(moved, cell)
+    after, _ = step(episodes, act(*[10.0] * many), key, 1000)  # all die
+    again = np.asarray(after.start) >= 64
+    assert abs(again.mean() - 0.5) < 0.125  # a standard deviation of 0.025
+    kept = np.asarray(x)[np.unique(cell, return_index=True)[1]]
+    assert set(np.asarray(after.env.obs[again, 0])) == set(kept)
+    np.testing.assert_array_equal(after.age[again], after.env.pipeline_state[again])
+    assert (after.age[~again] == 0).all() and (base.steps_taken(after) == 0).all()
+    once, _ = step(after, act(*[0.0] * many), key, 1000)
+    assert (base.steps_taken(once) == 1).all()
+    np.testing.assert_array_equal(once.age, after.age + 1)
+
+
+def test_an_episode_from_a_cell_ends_at_the_time_limit(key):
+    episodes = fill(at(in_cells(1.0, key), 1.5, 1.5, 1.5)._replace(age=jnp.full(N, LIMIT - 2)))
+    episodes = base.begin_again(episodes, key)
+    assert (episodes.age == LIMIT - 2).all()
+    episodes, transition = step(episodes, act(0, 0, 0), key)
+    assert not transition.truncated.any()
+    _, transition = step(episodes, act(0, 0, 0), key)
+    assert transition.truncated.all()
+
+
+def test_every_simulator_state_can_be_stored_and_begun_at(key):
+    env = envs.make("ant", backend="mujoco")
+    episodes = base.with_cells(base.init(env, 2, 8, key), 3, jnp.ones(2))
+    go = jax.jit(base.step, static_argnums=(0, 3))
+    episodes, _ = go(env, episodes, jnp.full((2, 8), 0.3), 100, key)
+    filled = base.fill_cells(episodes, jnp.array([2, 0]))
+    begun = base.begin_again(filled, key)
+    for i, row in enumerate(begun.start):
+        source = {8: 1, 10: 0}[int(row)]  # the cell of episode 1, and of episode 0
+        mine = jax.tree.map(lambda x, i=i: x[i], begun.env)
+        theirs = jax.tree.map(lambda x, i=source: x[i], episodes.env)
+        assert all(jax.tree.leaves(jax.tree.map(jnp.array_equal, mine, theirs)))
+    assert (begun.age == 1).all()

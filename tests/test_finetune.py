@@ -141,6 +141,25 @@ def test_restarts_are_states_of_successful_episodes():
     assert np.isfinite(metrics["critic_loss"])
 
 
+def test_first_episodes_begin_at_starts_and_not_where_restarts_will_be():
+    config = task_config(start_from="both", restart_share=0.5, first_episodes=20)
+    state, _ = finetune.start(config, archive_of(config, [-0.1, 0.1]))
+    items = jax.tree.map(np.asarray, state.learner.replay.items)
+    begins = np.arange(len(items.previous)) < int(state.learner.replay.size)
+    begins &= items.previous < 0
+    rows = -1 - items.previous[begins]
+    assert (rows < config.environment.num_starts).all()
+    left = np.asarray(state.learner.episodes.starts.obs)[rows]
+    moved = 0.2 * items.action[begins]
+    np.testing.assert_allclose(items.state[begins], left + moved, atol=1e-6)
+
+
+def test_a_run_on_a_task_does_not_restart_at_the_cells_of_its_source():
+    explored = preset("smoke", env="ant", cell_restarts=0.9)
+    config = source.on_task(explored, "there", "forward")
+    assert config.environment.cell_restarts == 0 and config.downstream.restart_share == 0.5
+
+
 def test_only_critics_learn_at_first():
     config = task_config(start_from="last", critic_steps=200)  # a segment of two
     state, _ = finetune.start(config, archive_of(config, [0.1]))

@@ -74,6 +74,21 @@ def test_a_run_that_cannot_fit_is_refused_by_what_takes_most(monkeypatch, settin
     memory.check(preset("smoke", env="pendulum"), jax.devices()[:1])
 
 
+def test_the_states_of_cells_are_counted(monkeypatch):
+    without = preset("smoke", env="ant", backend="mujoco")
+    config = without.replace(cell_restarts=0.5)
+    more = memory.of_a_seed(config.program())[memory.CELLS]
+    # qpos 15, qvel and warm start 14 each, observation 29, reward, done; and two integers.
+    assert more == memory.FLOAT * (
+        10_000 * (15 + 14 + 14 + 29 + 2 + 2) + 2 * config.budget.num_envs
+    )
+    assert memory.of_a_seed(without.program())[memory.CELLS] == 0
+    monkeypatch.setattr(machine, "memory", lambda: Room(2**21, "this machine"))
+    with pytest.raises(ConfigError, match=r"^cell-restarts is 0.5, so .*: set it to 0\.$"):
+        memory.check(config, jax.devices()[:1])
+    memory.check(without, jax.devices()[:1])
+
+
 @pytest.mark.parametrize("size", [2**31, 4 * 10**9, 2**63, 10**30])
 @pytest.mark.parametrize(
     "name", ["replay_size", "hidden_size", "num_envs", "num_starts", "batch_size", "num_seeds"]

@@ -116,7 +116,7 @@ def _play(
         policy, key = policy_and_key
         key_rows, key_play, key_history, key_fill = jax.random.split(key, 4)
         learner = played.learner
-        rows = base.draw_rows(learner.episodes.starts, at_once, key_rows)
+        rows = base.draw_rows(base.only_starts(learner.episodes), at_once, key_rows)
         starts = base.rows_of(learner.episodes.starts, rows)
         reached = occupancy.play(p, archive, policy, starts, key_play)
         returns = occupancy.task_returns(p, starts, reached)

@@ -73,6 +73,10 @@ def init(components: Components, key: jax.Array) -> Learner:
         restarts = jax.tree.map(lambda x: x[:NUM_RESTARTS], episodes.starts)
         no_age = jnp.zeros(restarts.done.shape, jnp.int32)
         episodes = base.with_restarts(episodes, restarts, base.Restarts(jnp.zeros(()), no_age))
+    if config.environment.cell_restarts:
+        of_agent = (jnp.arange(num_rows) < config.budget.num_envs).astype(jnp.float32)
+        share = config.environment.cell_restarts * of_agent
+        episodes = base.with_cells(episodes, components.grid.num_cells, share)
     episodic = components.bonus and components.bonus.episodic
     remembered = episodic.size if episodic else dims
     memory = None
@@ -152,6 +156,7 @@ def step(
     components: Components, method: Method, learner: Learner, key: jax.Array
 ) -> tuple[Learner, Metrics]:
     """Steps all envs once, then takes the gradient steps; metrics named num_ are counts."""
+    learner = _with_cells_filled(components, learner)
     keys, length = _keys(key), components.config.environment.episode_length
     episodes, everyone = base.step(
         components.env, learner.episodes, _action(components, learner, keys), length, keys.env
@@ -172,6 +177,7 @@ def _step_beside(
 ) -> tuple[Learner, Metrics]:
     """Steps all envs once; beside it, takes the gradient steps, if the draw holds anything."""
     length = components.config.environment.episode_length
+    learner = _with_cells_filled(components, learner)
 
     def work(key):
         learn = functools.partial(_learn, components, method, learner, drawn)
@@ -199,6 +205,15 @@ def _updated(
     )
 
 
+def _with_cells_filled(components: Components, learner: Learner) -> Learner:
+    """The learner whose episodes have filled the cells in which they are, if they restart there."""
+    if not components.config.environment.cell_restarts:
+        return learner
+    # Filled before the step, which draws restarts: the other way round, XLA would copy the pool.
+    cell = histogram.cells(learner.episodes.env.obs, components.grid)
+    return learner._replace(episodes=base.fill_cells(learner.episodes, cell))
+
+
 def _action(components: Components, learner: Learner, keys: _Keys) -> jax.Array:
     """The actions of the agent in its environments, and of the random baseline in its own."""
     config = components.config
@@ -221,14 +236,14 @@ def _record(
 ) -> tuple[Learner, Metrics]:
     """Adds the transitions of a vector step to all that remembers them."""
     config = components.config
-    age = learner.episodes.age[: config.budget.num_envs]
+    taken = base.steps_taken(learner.episodes)[: config.budget.num_envs]
     transition = jax.tree.map(lambda x: x[: config.budget.num_envs], everyone)
     others = jax.tree.map(lambda x: x[config.budget.num_envs :], everyone)
 
     features = components.phi(transition.next_observation)
     history = reservoir.add(learner.history, features, transition.valid, keys.history)
     reference = _refreshed(components, method, learner, history)
-    bonus, memory, novelty = _episodic(components, learner, transition, features, age)
+    bonus, memory, novelty = _episodic(components, learner, transition, features, taken)
     ring, rows = experience.add(
         components, reference, learner.replay, transition, learner.place, novelty, keys.yaw
     )
@@ -349,20 +364,22 @@ def _changes_within_iteration(method: Method) -> jax.Array:
     return method.from_history & (method.refresh_period > 0)
 
 
-def _episodic(components, learner, transition: Transition, features, age):
+def _episodic(components, learner, transition: Transition, features, taken):
     """The bonus, the memory with the states left, and the episodic term of the states reached."""
     config, bonus, memory = components.config, learner.bonus, learner.memory
     if memory is None:
         return bonus, memory, jnp.zeros(config.budget.num_envs)
     rows, left = jnp.arange(config.budget.num_envs), components.phi(transition.observation)
     if components.bonus is None:
-        memory = memory.at[rows, age].set(left)
-        novelty = rewards.episodic_bonus(features, memory, age + 1, config.intrinsic.num_neighbors)
+        memory = memory.at[rows, taken].set(left)
+        novelty = rewards.episodic_bonus(
+            features, memory, taken + 1, config.intrinsic.num_neighbors
+        )
         return bonus, memory, novelty
     episodic = components.bonus.episodic
-    memory = memory.at[rows, age].set(episodic.embed(bonus, left))
+    memory = memory.at[rows, taken].set(episodic.embed(bonus, left))
     embedded = episodic.embed(bonus, features)
-    bonus, novelty = episodic.novelty(bonus, embedded, memory, age + 1)
+    bonus, novelty = episodic.novelty(bonus, embedded, memory, taken + 1)
     return bonus, memory, novelty
 
 

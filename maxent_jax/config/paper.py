@@ -11,6 +11,7 @@ _PAPER: dict[str, tuple[Any, str]] = {
     "torque_limit": (1.0, "torques are limited to a fraction of the control range"),
     "end_flipped": (False, "an episode also ends when the robot is upside down"),
     "end_unhealthy": (True, "an episode continues after health fails"),
+    "cell_restarts": (0.0, "episodes also begin at states of visited cells"),
     "policy_inputs": ("state", "networks see the state in the robot's heading frame"),
     "yaw_copies": (0, "SAC also learns from episodes turned by a random yaw"),
     "reward": ("paper", "the reward's form is not p log R"),

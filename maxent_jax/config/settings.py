@@ -54,6 +54,9 @@ class Environment(_Checked):
     """Time limit of an episode, in control steps."""
     num_starts: int = 4096
     """Random start states in the pool that episodes start from."""
+    cell_restarts: float = 0.0
+    """Share of the training episodes that begin at a state of a visited cell (Go-Explore); a cell
+    is drawn in proportion to 1 / its visits. Departs from the paper."""
     torque_limit: float = 1.0
     """Fraction of the control range that the agent may use; below 1 departs from the paper."""
     end_flipped: bool = False

@@ -37,12 +37,13 @@ _POSITIVE = (
 )
 _AT_MOST_ONE = (
     *("torque_limit", "discount", "soft_update_rate", "eta", "actor_average", "restart_share"),
+    "cell_restarts",
 )
 _NOT_NEGATIVE = (
     *("seed", "plateau_segments", "plateau_tolerance", "shaping", "episodic_weight"),
     *("alive_bonus", "actor_average"),
     *("intrinsic_weight", "intrinsic_decay", "source_seed", "source_iterations"),
-    *("critic_steps", "restart_share"),
+    *("critic_steps", "restart_share", "cell_restarts"),
     *("yaw_copies", "discount", "target_entropy_scale", "policy_lag", "skill_size"),
 )
 
@@ -270,6 +271,11 @@ def _check_together(c: SimpleNamespace, row: EnvironmentRow) -> None:
         (
             c.start_from in names.PLAYING and c.task == tasks.NONE,
             f"start-from is {c.start_from}, but task is none: name the task that is measured.",
+        ),
+        (
+            c.cell_restarts and c.restart_share,
+            f"cell-restarts is {c.cell_restarts} and restart-share is {c.restart_share}: episodes "
+            "restart at states of cells or of the first episodes, so set one of them to 0.",
         ),
         (c.policy_lag > 1, f"policy-lag is {c.policy_lag}, but must be 0 or 1."),
         (

@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from brax.envs.base import Env, State
 
+from maxent_jax.envs import cells
+from maxent_jax.envs.cells import Cells
 from maxent_jax.envs.physics import Work
 from maxent_jax.envs.task import MujocoEnv
 from maxent_jax.types import Transition
@@ -23,6 +25,7 @@ __all__ = [
     "begin_again",
     "draw_rows",
     "draw_starts",
+    "fill_cells",
     "finite_rows",
     "init",
     "only_starts",
@@ -30,6 +33,8 @@ __all__ = [
     "select_rows",
     "step",
     "step_beside",
+    "steps_taken",
+    "with_cells",
     "with_restarts",
 ]
 
@@ -48,7 +53,7 @@ class Episodes(NamedTuple):
     age: jax.Array  # [N] int32, control steps since the start of the episode
     start: jax.Array  # [N] int32, row of its start in the pool
     starts: State  # [R, ...] the pool, R far larger than N: a single start biases entropy
-    restarts: Restarts | None = None
+    restarts: Restarts | Cells | None = None  # with states in the pool's last rows
 
 
 def init(env: Env, num_envs: int, num_starts: int, key: jax.Array) -> Episodes:
@@ -154,19 +159,58 @@ def _draw_beginnings(
     """Draws rows of the pool at which episodes begin [num], and their ages."""
     if episodes.restarts is None:
         return draw_rows(episodes.starts, num, key), 0
-    share, ages = episodes.restarts
+    restarts = episodes.restarts
     key_which, key_start, key_restart = jax.random.split(key, 3)
-    restart = jax.random.randint(key_restart, (num,), 0, ages.shape[0])
     start = draw_rows(only_starts(episodes), num, key_start)
-    again = jax.random.uniform(key_which, (num,)) < share
-    first = episodes.starts.done.shape[0] - ages.shape[0]
-    return jnp.where(again, first + restart, start), jnp.where(again, ages[restart], 0)
+    again = jax.random.uniform(key_which, (num,)) < restarts.share
+    if isinstance(restarts, Cells):
+        restart, has_state = cells.draw(restarts, num, key_restart)
+        again &= has_state
+    else:
+        restart = jax.random.randint(key_restart, (num,), 0, restarts.age.shape[0])
+    start = jnp.where(again, _first_restart(episodes) + restart, start)
+    return start, jnp.where(again, restarts.age[restart], 0)
 
 
-def with_restarts(episodes: Episodes, states: State, restarts: Restarts) -> Episodes:
+def with_restarts(episodes: Episodes, states: State, restarts: Restarts | Cells) -> Episodes:
     """Adds states [Q, ...] to the pool, at which a share of the episodes begins from now on."""
     pool = jax.tree.map(lambda x, y: jnp.concatenate([x, y]), only_starts(episodes), states)
     return episodes._replace(starts=pool, restarts=restarts)
+
+
+def with_cells(episodes: Episodes, num_cells: int, share: jax.Array) -> Episodes:
+    """Adds a row for each cell to the pool, without visits; `fill_cells` stores a state in it.
+
+    Args:
+      episodes: N episodes.
+      num_cells: Q.
+      share: [N] of the episodes that begin at a cell from now on.
+    Returns:
+      The episodes.
+    """
+    pool = only_starts(episodes)
+    rows = jnp.arange(num_cells) % pool.done.shape[0]
+    return with_restarts(episodes, rows_of(pool, rows), cells.init(num_cells, share))
+
+
+def fill_cells(episodes: Episodes, cell: jax.Array) -> Episodes:
+    """Visits the cells that the episodes are in, and stores the first state of each.
+
+    A stored state is never replaced, because the replay refers to it. No terminal state is stored,
+    and none at the time limit: no episode stays in one.
+
+    Args:
+      episodes: N episodes, with `Cells`.
+      cell: [N] int32, the cell of each episode; Q for a state off the grid.
+    Returns:
+      The episodes with the cells after the visit.
+    """
+    assert isinstance(episodes.restarts, Cells)
+    visited, new = cells.visit(episodes.restarts, cell, episodes.age)
+    into = _first_restart(episodes) + new  # beyond the pool's end nothing is stored
+    store = lambda pool, states: pool.at[into].set(states, mode="drop")
+    pool = jax.tree.map(store, episodes.starts, episodes.env)
+    return episodes._replace(starts=pool, restarts=visited)
 
 
 def begin_again(episodes: Episodes, key: jax.Array) -> Episodes:
@@ -182,8 +226,23 @@ def only_starts(episodes: Episodes) -> State:
     """Returns the pool without restarts, [R, ...]."""
     if episodes.restarts is None:
         return episodes.starts
-    num = episodes.starts.done.shape[0] - episodes.restarts.age.shape[0]
+    num = _first_restart(episodes)
     return jax.tree.map(lambda x: x[:num], episodes.starts)
+
+
+def steps_taken(episodes: Episodes) -> jax.Array:
+    """Returns the steps of each episode since it began, at a start or at a restart, [N] int32."""
+    if episodes.restarts is None:
+        return episodes.age
+    restart = episodes.start - _first_restart(episodes)
+    first_age = jnp.where(restart >= 0, episodes.restarts.age[jnp.maximum(restart, 0)], 0)
+    return episodes.age - first_age
+
+
+def _first_restart(episodes: Episodes) -> int:
+    """The pool's first row that is not a start."""
+    assert episodes.restarts is not None
+    return episodes.starts.done.shape[0] - episodes.restarts.age.shape[0]
 
 
 def select_rows(mask: jax.Array, on_true: Tree, on_false: Tree) -> Tree:

@@ -14,6 +14,7 @@ import jax
 from maxent_jax import algorithm, components
 from maxent_jax.config import Config
 from maxent_jax.config.validation import MOST
+from maxent_jax.envs import base
 from maxent_jax.errors import ConfigError
 from maxent_jax.runs import machine
 from maxent_jax.runs.machine import Room, readable
@@ -21,6 +22,7 @@ from maxent_jax.runs.machine import Room, readable
 FLOAT = 4  # bytes
 LARGE_POLICY = 2**28  # bytes of one; from here on, a message blames their size, not their number
 MANY_COPIES = 64
+CELLS = "cell-restarts"  # the states of its cells take the same memory whatever its value
 # Settings whose arrays the devices of a seed divide among them, see devices.placement.
 DIVIDED = ("replay-size", "yaw-copies", "num-envs")
 
@@ -39,9 +41,10 @@ def check(config: Config, devices: Sequence[jax.Device]) -> None:
     if config.num_seeds > 1 and total / config.num_seeds <= room.size:
         setting = "num-seeds"
     value = config[setting.replace("-", "_")]
+    remedy = "set it to 0" if setting == CELLS else f"choose a smaller {setting}"
     raise ConfigError(
         f"{setting} is {value}, so the run needs at least {readable(total)} of memory, "
-        f"but {room.of} has {readable(room.size)}: choose a smaller {setting}."
+        f"but {room.of} has {readable(room.size)}: {remedy}."
     )
 
 
@@ -107,6 +110,10 @@ def of_a_seed(config: Config) -> dict[str, int]:
     step[layers] += (
         FLOAT * c.learner.batch_size * c.learner.hidden_size * c.learner.hidden_layers * 3
     )
+    plain, cells = learner.episodes.starts, 0
+    if c.environment.cell_restarts:
+        plain = jax.eval_shape(base.only_starts, learner.episodes)
+        cells = nbytes(learner.episodes.starts) - nbytes(plain) + nbytes(learner.episodes.restarts)
     beside = max(begin_or_end, step, key=lambda need: sum(need.values()))
     of_state = {
         "replay-size" if c.learner.yaw_copies < MANY_COPIES else "yaw-copies": nbytes(
@@ -115,7 +122,8 @@ def of_a_seed(config: Config) -> dict[str, int]:
         "hidden-size": agent + (policies if large else 0),
         "num-iterations": nbytes(state.method) + (0 if large else policies),
         "num-envs": nbytes((learner.episodes.env, learner.place, learner.memory)),
-        "num-starts": nbytes(learner.episodes.starts),
+        "num-starts": nbytes(plain),
+        CELLS: cells,
         "reference-size": nbytes((learner.reference, learner.history)),
     }
     return {name: of_state.get(name, 0) + beside.get(name, 0) for name in of_state.keys() | beside}

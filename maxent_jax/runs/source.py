@@ -125,6 +125,7 @@ def on_task(
         "task": task,
         "num_seeds": 1,
         "random_baseline": False,
+        "cell_restarts": 0.0,
         "source": source,
         "start_from": start_from,
     }
