@@ -145,10 +145,17 @@ def test_of_a_finished_study_nothing_is_submitted(tmp_path, slurm, monkeypatch):
     assert not (slurm / "script").exists()
 
 
+def those_of_v():
+    """Of a study of tasks, V's cell and the two that start from it; and which share that is."""
+    every = protocol.make("downstream", "toy", 1)
+    count = sum(cell.source is None for cell in every)
+    return protocol.share(every, 0, count), f"0/{count}"
+
+
 @pytest.mark.parametrize("dies", [False, True], ids=["finishes", "dies"])
 def test_a_worker_waits_for_what_another_trains_and_others_start_from(tmp_path, monkeypatch, dies):
     """The other process holds V, from which two cells start; it finishes V, or is killed."""
-    cells = protocol.share(protocol.make("downstream", "toy", 1), 0, 7)
+    cells, _ = those_of_v()
     names = [cell.name for cell in cells]
     assert names == ["pendulum-V-0", "pendulum-V-1-gymnasium-0", "pendulum-V-2-gymnasium-0"]
     done, waited = [], []
@@ -250,7 +257,8 @@ def test_a_study_whose_workers_are_killed_ends_as_one_that_was_not(tmp_path):
 def test_a_job_whose_time_is_over_saves_and_is_requeued(tmp_path, slurm, monkeypatch):
     """Two workers share a cell and two that start from it; the first to train is told to stop."""
     monkeypatch.setenv("RUNS", "1")
-    study = ["downstream", *TOY, "--shard", "0/7", "--out", tmp_path]
+    cells, share = those_of_v()
+    study = ["downstream", *TOY, "--shard", share, "--out", tmp_path]
     options = ["--launcher", "submitit", "--num-workers", "2", "--slurm", "time=60"]
     commands.in_subprocess("reproduce", *study, *options)
     logs = [tmp_path / "jobs" / f"{JOB}_{i}_0_log.out" for i in range(2)]
@@ -261,7 +269,6 @@ def test_a_job_whose_time_is_over_saves_and_is_requeued(tmp_path, slurm, monkeyp
     assert log.count("stopping at the next checkpoint") == 1
     assert f"Requeued job {JOB}_{first} " in log
     assert log.count("Starting with JobEnvironment") == 2
-    cells = protocol.share(protocol.make("downstream", "toy", 1), 0, 7)
     assert all(protocol.finished(tmp_path / "downstream", cell) for cell in cells)
     rows = rows_of(tmp_path / "downstream")
     assert list(rows) == sorted(cell.name for cell in cells)

@@ -12,6 +12,7 @@ _PAPER: dict[str, tuple[Any, str]] = {
     "end_flipped": (False, "an episode also ends when the robot is upside down"),
     "end_unhealthy": (True, "an episode continues after health fails"),
     "cell_restarts": (0.0, "episodes also begin at states of visited cells"),
+    "skill_size": (0, "each episode has a skill, which the networks see"),
     "policy_inputs": ("state", "networks see the state in the robot's heading frame"),
     "yaw_copies": (0, "SAC also learns from episodes turned by a random yaw"),
     "reward": ("paper", "the reward's form is not p log R"),

@@ -1,8 +1,8 @@
 """Studies: the runs that make up an experiment, and which of them are finished.
 
 A study is a list of cells. A cell is a run of the command `train` in its own directory. All methods
-of a study have the same env steps and gradient steps, and are measured in the same projection.
-Loads no array library.
+of a study have the same env steps and gradient steps (METRA has its authors' gradient steps), and
+are measured in the same projection. Loads no array library.
 """
 
 import json
@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from maxent_jax.config import DEFAULTS, Config, preset, tasks
-from maxent_jax.config.registry import BASELINES, CLASSIC_ENVS, MUJOCO_ENVS, PLAIN
+from maxent_jax.config.registry import BASELINES, CLASSIC_ENVS, METRA, MUJOCO_ENVS, PLAIN
 from maxent_jax.errors import UsageError
 from maxent_jax.runs import files, integrity, locks, source
 
@@ -208,7 +208,11 @@ STUDIES: dict[str, Study] = {
     ),
     "baselines": Study(
         "baselines with one policy each, and V",
-        {"V": {"method": "v"} | PLAIN, **{name: {"method": name} for name in BASELINES}},
+        {
+            "V": {"method": "v"} | PLAIN,
+            # METRA has a learner of its own: see the study `rivals`.
+            **{name: {"method": name} for name in BASELINES if name != METRA},
+        },
         CLASSIC,
         together=True,
         mepol=True,
