@@ -1,6 +1,7 @@
 """The components of a config: what it makes once and every step uses."""
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -50,9 +51,12 @@ def _make(config: Config) -> Components:
             deviations = {name: config[name] for name in envs.DEVIATIONS}
         env = entry.make(config.environment.backend, config.environment.physics, **deviations)
         phi = make_feature_map(config.env)
-        if config.environment.skill_size:
+        grid = entry.grid
+        if size := config.environment.skill_size:
             phi = features.of_leading(phi, observation_size(env))
-            env = WithSkill(env, config.environment.skill_size)
+            if grid.transform:
+                grid = grid._replace(transform=_without_skill(grid.transform, size))
+            env = WithSkill(env, size)
         num_dims = num_seen = observation_size(env)
         inputs = lambda observation: observation
         if config.learner.policy_inputs == "heading":
@@ -72,7 +76,7 @@ def _make(config: Config) -> Components:
                 config.environment.skill_size,
                 config.learner.hidden_size,
             )
-        found = Components(config, env, entry.grid, entry.torso, num_seen, sac, phi, bonus)
+        found = Components(config, env, grid, entry.torso, num_seen, sac, phi, bonus)
         return with_task(found, config.downstream.task)
 
 
@@ -82,8 +86,25 @@ def with_task(components: Components, name: str) -> Components:
     if name == task_names.NONE:
         return components._replace(task=None)
     task = tasks.make(name, components.config.env, components.env)
+    size = components.config.environment.skill_size
+    if size and task.reward:
+        task = task._replace(reward=_paid_without_skill(task.reward, size))
     registry.in_use.add(("task", name))
     return components._replace(task=task)
+
+
+def _without_skill(function: Callable[[jax.Array], jax.Array], size: int) -> Callable:
+    """The function of states [..., D], for states [..., D + size] that end with a skill."""
+    return lambda states: function(states[..., :-size])
+
+
+def _paid_without_skill(reward: tasks.Reward, size: int) -> tasks.Reward:
+    """The same for the reward of a transition."""
+
+    def paid(observation, action, next_observation):
+        return reward(observation[..., :-size], action, next_observation[..., :-size])
+
+    return paid
 
 
 def _units(config: Config, grid: Grid, num_features: int) -> jax.Array:

@@ -12,6 +12,7 @@ from maxent_jax import algorithm, components, envs
 from maxent_jax.algorithm import experience
 from maxent_jax.analysis import gymnasium_play
 from maxent_jax.config import preset
+from maxent_jax.density import histogram
 from maxent_jax.envs import base
 from maxent_jax.envs.skills import WithSkill
 from maxent_jax.errors import ConfigError
@@ -75,6 +76,19 @@ def test_the_networks_and_metra_see_the_skill_and_features_do_not(key):
     drawn = experience.sample(p, ring, starts, (32,), key)
     np.testing.assert_array_equal(drawn.observation[:, -Z:], drawn.next_observation[:, -Z:])
     np.testing.assert_allclose(jnp.linalg.norm(drawn.observation[:, -Z:], axis=1), 1, rtol=1e-6)
+
+
+@pytest.mark.parametrize("env", ["pendulum", "mountain_car", "ant"])
+def test_cells_and_tasks_do_not_see_the_skill(env, key):
+    bare, own = (preset("smoke", env=env, task="gymnasium", **x) for x in ({}, METRA))
+    of_bare, p = components.make(bare), components.make(own)
+    states = jax.vmap(p.env.reset)(jax.random.split(key, 9)).obs
+    cells = lambda p, states: histogram.cells(states, p.grid)
+    np.testing.assert_array_equal(cells(p, states), cells(of_bare, states[:, :-Z]))
+    action, unpaid = jnp.zeros((9, p.env.action_size)), jnp.zeros(9)
+    paid = p.task.pay(states, action, states, unpaid)
+    expected = of_bare.task.pay(states[:, :-Z], action, states[:, :-Z], unpaid)
+    np.testing.assert_array_equal(paid, expected)
 
 
 def test_gymnasium_gives_each_episode_a_skill_of_its_own():
