@@ -34,6 +34,11 @@ class Components(NamedTuple):
     bonus: Bonus | None = None
     task: tasks.Task | None = None
 
+    @property
+    def in_metres(self) -> bool:
+        """Whether the grid's coordinates are metres, so that unit cells mean something."""
+        return registry.environment(self.config.env).in_metres
+
 
 def make(config: Config) -> Components:
     """Returns the components of the config's program; each program makes them once."""

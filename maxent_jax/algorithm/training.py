@@ -11,7 +11,6 @@ from maxent_jax.algorithm import experience
 from maxent_jax.algorithm.experience import Reference
 from maxent_jax.algorithm.methods import Method
 from maxent_jax.components import Components
-from maxent_jax.config import registry
 from maxent_jax.density import histogram, plane, reservoir
 from maxent_jax.density.reservoir import Reservoir
 from maxent_jax.envs import base
@@ -97,7 +96,7 @@ def init(components: Components, key: jax.Array) -> Learner:
         env_steps=zero,
         gradient_steps=zero,
         first_steps=None if components.task is None else zero,
-        plane=plane.empty() if registry.environment(config.env).in_metres else None,
+        plane=plane.empty() if components.in_metres else None,
     )
 
 
@@ -462,8 +461,8 @@ def _paid_by_bonus(
     components: Components, learner: Learner, drawn: Experience, key: jax.Array
 ) -> tuple[Any, jax.Array, Metrics]:
     """The bonus after learning from the draw, its reward before learning [..., 1], and metrics."""
-    # It sees features, as every other reward does. Its reward is divided by the standard deviation
-    # over the draw: most methods prescribe no scale, but SAC's temperature needs one.
+    # It sees features, as every other reward does; with skills also states. Unless it has a scale,
+    # its reward is divided by the standard deviation over the draw: SAC's temperature needs one.
     payer = components.bonus
     assert payer is not None
     key_value, key_learn = jax.random.split(key)

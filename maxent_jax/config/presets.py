@@ -2,7 +2,10 @@
 
 from typing import Any
 
+from maxent_jax.checks import check_choice
+from maxent_jax.config import registry
 from maxent_jax.config.registry import CLASSIC_ENVS, METRA, MUJOCO_ENVS
+from maxent_jax.errors import ConfigError
 
 _FAST_LEARNER: dict[str, Any] = dict(
     critic_layer_norm=True,
@@ -116,6 +119,22 @@ PROTOCOLS: dict[str, dict[str, Any]] = {
         deterministic=True,
     ),
 }
+
+
+def of_protocol(name: str, env: str) -> dict[str, Any]:
+    """Returns the settings of a protocol.
+
+    Raises:
+      ConfigError: the protocol is unknown, or not for this environment.
+    """
+    check_choice("protocol", name, PROTOCOLS)
+    settings = PROTOCOLS[name]
+    if settings and not registry.environment(env).is_robot:
+        raise ConfigError(
+            f"protocol is {name}, but {env} has none: choose {', '.join(MUJOCO_ENVS)}."
+        )
+    return settings
+
 
 # What a preset changes in some environments.
 IN_ENV: dict[tuple[str, str], dict[str, Any]] = {

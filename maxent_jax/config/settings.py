@@ -382,7 +382,7 @@ def preset(name: str, **changes: Any) -> Config:
     in_env = presets.IN_ENV.get((name, env), {})
     of_method = registry.method(method).settings
     of_both = presets.OF_METHOD_IN_ENV.get((name, env, method), {})
-    of_protocol = validation.protocol(changes.get("protocol", Config.protocol), env)
+    of_protocol = presets.of_protocol(changes.get("protocol", Config.protocol), env)
     of_task = tasks.settings(changes.get("task", tasks.NONE), env)
     settings = {**presets.PRESETS[name], **in_env, **of_method, **of_both, **of_protocol, **of_task}
     return from_flat({"preset": name, **settings, **changes})

@@ -109,21 +109,6 @@ def check(env: str, method: str, settings: Mapping[str, Any]) -> None:
     _check_together(SimpleNamespace(**settings), row)
 
 
-def protocol(name: str, env: str) -> Mapping[str, Any]:
-    """Returns the settings of a protocol.
-
-    Raises:
-      ConfigError: the protocol is unknown, or not for this environment.
-    """
-    check_choice("protocol", name, presets.PROTOCOLS)
-    settings = presets.PROTOCOLS[name]
-    if settings and not registry.environment(env).is_robot:
-        raise ConfigError(
-            f"protocol is {name}, but {env} has none: choose {', '.join(registry.MUJOCO_ENVS)}."
-        )
-    return settings
-
-
 def check_physics(env: str, backend: str, physics: str) -> None:
     """Raises ConfigError if the environment does not have the backend or the physics."""
     row = registry.environment(env)

@@ -66,7 +66,7 @@ class Bonus(NamedTuple):
     """state, share [bins, bins] of the mixture's states in each cell -> state; called when an
     iteration begins"""
     has_scale: bool = False
-    """The reward keeps its size; without, it is divided by its standard deviation"""
+    """Whether the reward's size has a meaning; else it is divided by its standard deviation."""
 
 
 class Setting(NamedTuple):

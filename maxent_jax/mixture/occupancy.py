@@ -7,7 +7,6 @@ import jax.numpy as jnp
 
 from maxent_jax import mixture, rewards, rollout
 from maxent_jax.components import Components
-from maxent_jax.config import registry
 from maxent_jax.config.registry import CORRECTIVE
 from maxent_jax.density import entropy, histogram, plane
 from maxent_jax.density.knn import NONE_EXCLUDED, knn_distances
@@ -284,7 +283,7 @@ def measures(components: Components, occupancy: Occupancy, key: jax.Array) -> Me
 
 
 def _unit_cells(components: Components, occupancy: Occupancy) -> Metrics:
-    if not registry.environment(components.config.env).in_metres:
+    if not components.in_metres:
         return {}
     places = histogram.locate(occupancy.states, components.grid)
     visited = plane.visit(plane.empty(), places, occupancy.weight > 0)

@@ -13,7 +13,6 @@ from maxent_jax.config import registry
 from maxent_jax.density import histogram
 from maxent_jax.visual import plotting
 
-EPISODES = 5  # of each policy
 EPISODES_WITH_SKILLS = 16  # of each policy, so that the newest one shows skills all around
 
 
@@ -44,7 +43,9 @@ def draw_missing(directory: Path) -> None:
 def _draw(directory: Path, modules: Sequence[str] = ()) -> None:
     registry.import_modules(modules)
     run = load_run(directory)
-    has_skills = run.config.environment.skill_size > 0
-    visited = run.occupancy(EPISODES_WITH_SKILLS if has_skills else EPISODES)
+    if run.config.environment.skill_size:
+        visited = run.occupancy(EPISODES_WITH_SKILLS)
+    else:
+        visited = run.occupancy()
     cells = histogram.count(visited.states, run.components.grid, visited.weight)
     plotting.save_all(run, np.asarray(cells), paths(visited))

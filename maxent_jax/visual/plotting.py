@@ -142,15 +142,15 @@ def fireworks(run: Run, paths: Paths) -> Figure:
     ax = figure.subplots()
     draw_paths(ax, run, paths)
     if run.config.environment.skill_size:
-        for degrees in range(0, 360, 90):
-            color = _skill_color(np.radians(degrees))
-            ax.plot([], [], color=color, label=f"skill at {degrees}°")
-        ax.set_title("paths of the newest policy by skill; dots mark their ends")
-        ax.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
-        return _finish(figure, run)
-    for policy, color in enumerate(policy_colors(run.num_policies)):
-        ax.plot([], [], color=color, label=f"π{policy}" + (" (untrained)" if policy == 0 else ""))
-    ax.set_title("paths of the archived policies; dots mark their ends")
+        whose = "newest policy by skill"
+        named = [(f"skill at {a}°", _skill_color(np.radians(a))) for a in range(0, 360, 90)]
+    else:
+        whose = "archived policies"
+        names = ["π0 (untrained)", *(f"π{i}" for i in range(1, run.num_policies))]
+        named = list(zip(names, policy_colors(run.num_policies), strict=True))
+    for name, color in named:
+        ax.plot([], [], color=color, label=name)
+    ax.set_title(f"paths of the {whose}; dots mark their ends")
     ax.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
     return _finish(figure, run)
 
