@@ -20,8 +20,10 @@ jax.config.update("jax_legacy_prng_key", "error")
 
 # Files that take longest come first, so that no worker is left with one at the end.
 LONGEST = ("test_protocol", "test_train", "test_knn", "test_physics", "test_intrinsic")
-# Toy programs run for milliseconds and compile for seconds: they are spared most optimisations.
+# Toy programs run for milliseconds and compile for seconds: they are spared most optimisations, and
+# XLA's newer code generator, which takes twice as long.
 FAST = "JAX_DISABLE_MOST_OPTIMIZATIONS"
+OLDER_EMITTERS = "--xla_cpu_use_fusion_emitters=false"
 
 
 def pytest_addoption(parser):
@@ -32,6 +34,9 @@ def pytest_configure(config):
     fast = not config.getoption("--optimised")
     jax.config.update(FAST.lower(), fast)
     os.environ[FAST] = str(int(fast))  # of subprocesses
+    flags = os.environ.get("XLA_FLAGS", "")
+    if fast and OLDER_EMITTERS not in flags:  # a worker has them from pytest's first process
+        os.environ["XLA_FLAGS"] = f"{flags} {OLDER_EMITTERS}".strip()
 
 
 def pytest_collection_modifyitems(items):
