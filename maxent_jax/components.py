@@ -16,7 +16,7 @@ from maxent_jax.envs.skills import WithSkill
 from maxent_jax.envs.task import observation_size
 from maxent_jax.envs.torso import Torso
 from maxent_jax.features import make_feature_map
-from maxent_jax.intrinsic import Bonus
+from maxent_jax.intrinsic import Bonus, Setting
 from maxent_jax.sac import agent
 from maxent_jax.types import Features
 
@@ -70,17 +70,17 @@ def _make(config: Config) -> Components:
         sac = agent.make(config, num_dims, env.action_size, inputs)
         bonus = None
         if config.intrinsic.bonus != "none":
-            bonus = intrinsic.make(
-                config.intrinsic.bonus,
-                len(phi.names),
-                env.action_size,
-                _units(config, entry.grid, len(phi.names)),
-                config.learner.learning_rate,
-                entry.grid.num_cells,
-                num_seen - config.environment.skill_size,
-                config.environment.skill_size,
-                config.learner.hidden_size,
+            setting = Setting(
+                observation_size=len(phi.names),
+                action_size=env.action_size,
+                scale=_units(config, entry.grid, len(phi.names)),
+                learning_rate=config.learner.learning_rate,
+                num_cells=entry.grid.num_cells,
+                state_size=num_seen - config.environment.skill_size,
+                skill_size=config.environment.skill_size,
+                hidden_size=config.learner.hidden_size,
             )
+            bonus = intrinsic.make(config.intrinsic.bonus, setting)
         found = Components(config, env, grid, entry.torso, num_seen, sac, phi, bonus)
         return with_task(found, config.downstream.task)
 

@@ -72,13 +72,13 @@ class Bonus(NamedTuple):
 class Setting(NamedTuple):
     """The arguments from which every bonus is made."""
 
-    observation_size: int
-    action_size: int
-    scale: jax.Array  # [D] the unit of each entry of an observation
-    learning_rate: float
+    observation_size: int  # D
+    action_size: int  # A
+    scale: jax.Array  # [D] positive, the unit of each entry of an observation
+    learning_rate: float  # of Adam, if the bonus learns by gradients
     num_cells: int  # of the grid on which coverage is counted
-    state_size: int = 0  # of what the networks see, without the skill
-    skill_size: int = 0
+    state_size: int = 0  # I, of what the networks see, without the skill
+    skill_size: int = 0  # Z
     hidden_size: int = HIDDEN_SIZE  # of the actor and the critics
 
 
