@@ -1,18 +1,17 @@
 """The components of a config: what it makes once and every step uses."""
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from maxent_jax import envs, features, intrinsic, tasks
+from maxent_jax import envs, intrinsic, tasks
 from maxent_jax.config import Config, registry
 from maxent_jax.config import tasks as task_names
 from maxent_jax.density.histogram import Grid
+from maxent_jax.envs import skills
 from maxent_jax.envs.base import Env
-from maxent_jax.envs.skills import WithSkill
 from maxent_jax.envs.task import observation_size
 from maxent_jax.envs.torso import Torso
 from maxent_jax.features import make_feature_map
@@ -55,13 +54,10 @@ def _make(config: Config) -> Components:
         if registry.environment(config.env).is_robot:
             deviations = {name: config[name] for name in envs.DEVIATIONS}
         env = entry.make(config.environment.backend, config.environment.physics, **deviations)
-        phi = make_feature_map(config.env)
-        grid = entry.grid
+        phi, grid = make_feature_map(config.env), entry.grid
         if size := config.environment.skill_size:
-            phi = features.of_leading(phi, observation_size(env))
-            if grid.transform:
-                grid = grid._replace(transform=_without_skill(grid.transform, size))
-            env = WithSkill(env, size)
+            env, phi = skills.WithSkill(env, size), skills.BareFeatures(phi, size)
+            grid = skills.bare_grid(grid, size)
         num_dims = num_seen = observation_size(env)
         inputs = lambda observation: observation
         if config.learner.policy_inputs == "heading":
@@ -93,23 +89,9 @@ def with_task(components: Components, name: str) -> Components:
     task = tasks.make(name, components.config.env, components.env)
     size = components.config.environment.skill_size
     if size and task.reward:
-        task = task._replace(reward=_paid_without_skill(task.reward, size))
+        task = task._replace(reward=skills.bare_reward(task.reward, size))
     registry.in_use.add(("task", name))
     return components._replace(task=task)
-
-
-def _without_skill(function: Callable[[jax.Array], jax.Array], size: int) -> Callable:
-    """The function of states [..., D], for states [..., D + size] that end with a skill."""
-    return lambda states: function(states[..., :-size])
-
-
-def _paid_without_skill(reward: tasks.Reward, size: int) -> tasks.Reward:
-    """The same for the reward of a transition."""
-
-    def paid(observation, action, next_observation):
-        return reward(observation[..., :-size], action, next_observation[..., :-size])
-
-    return paid
 
 
 def _units(config: Config, grid: Grid, num_features: int) -> jax.Array:

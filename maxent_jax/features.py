@@ -55,26 +55,6 @@ class FeatureMap:
         return jnp.concatenate([kept, projected], axis=-1)
 
 
-@dataclasses.dataclass(frozen=True)
-class _OfLeading:
-    """A feature map of the first entries of an observation."""
-
-    phi: Features
-    size: int
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.phi.names
-
-    def __call__(self, observation: jax.Array, /) -> jax.Array:
-        return self.phi(observation[..., : self.size])
-
-
-def of_leading(phi: Features, size: int) -> Features:
-    """Returns the feature map that sees only the first `size` entries of an observation."""
-    return _OfLeading(phi, size)
-
-
 def raw_projection(num_inputs: int) -> np.ndarray:
     """Returns [num_inputs, 5] float64 standard normal, always the same. Source: the paper, §5.1."""
     generator = np.random.default_rng(PROJECTION_SEED)
