@@ -46,39 +46,49 @@ def make(config: Config) -> Components:
 
 @functools.lru_cache(maxsize=8)
 def _make(config: Config) -> Components:
+    registry.in_use.update({("environment", config.env), ("bonus", config.intrinsic.bonus)})
     with jax.ensure_compile_time_eval():  # the first call may come during a trace
-        made_of = {("environment", config.env), ("bonus", config.intrinsic.bonus)}
-        registry.in_use.update(made_of)
-        entry = envs.entry(config.env)
-        deviations: dict[str, Any] = {}
-        if registry.environment(config.env).is_robot:
-            deviations = {name: config[name] for name in envs.DEVIATIONS}
-        env = entry.make(config.environment.backend, config.environment.physics, **deviations)
-        phi, grid = make_feature_map(config.env), entry.grid
-        if size := config.environment.skill_size:
-            env, phi = skills.WithSkill(env, size), skills.BareFeatures(phi, size)
-            grid = skills.bare_grid(grid, size)
-        num_dims = num_seen = observation_size(env)
-        inputs = lambda observation: observation
-        if config.learner.policy_inputs == "heading":
-            assert entry.torso is not None  # checked by Config
-            inputs, num_seen = entry.torso.heading_inputs, entry.torso.num_seen
-        sac = agent.make(config, num_dims, env.action_size, inputs)
-        bonus = None
-        if config.intrinsic.bonus != "none":
-            setting = Setting(
-                observation_size=len(phi.names),
-                action_size=env.action_size,
-                scale=_units(config, entry.grid, len(phi.names)),
-                learning_rate=config.learner.learning_rate,
-                num_cells=entry.grid.num_cells,
-                state_size=num_seen - config.environment.skill_size,
-                skill_size=config.environment.skill_size,
-                hidden_size=config.learner.hidden_size,
-            )
-            bonus = intrinsic.make(config.intrinsic.bonus, setting)
-        found = Components(config, env, grid, entry.torso, num_seen, sac, phi, bonus)
-        return with_task(found, config.downstream.task)
+        env = _make_env(config)
+    num_dims = observation_size(env)  # outside, where no operation of a reset is compiled
+    with jax.ensure_compile_time_eval():
+        return _make_around(config, env, num_dims)
+
+
+def _make_env(config: Config) -> Env:
+    deviations: dict[str, Any] = {}
+    if registry.environment(config.env).is_robot:
+        deviations = {name: config[name] for name in envs.DEVIATIONS}
+    own = config.environment
+    return envs.entry(config.env).make(own.backend, own.physics, **deviations)
+
+
+def _make_around(config: Config, env: Env, num_dims: int) -> Components:
+    """The components, given the environment without skills, whose states are [num_dims]."""
+    entry = envs.entry(config.env)
+    phi, grid = make_feature_map(config.env, num_dims), entry.grid
+    if size := config.environment.skill_size:
+        env, phi = skills.WithSkill(env, size), skills.BareFeatures(phi, size)
+        grid, num_dims = skills.bare_grid(grid, size), num_dims + size
+    num_seen, inputs = num_dims, lambda observation: observation
+    if config.learner.policy_inputs == "heading":
+        assert entry.torso is not None  # checked by Config
+        inputs, num_seen = entry.torso.heading_inputs, entry.torso.num_seen
+    sac = agent.make(config, num_dims, env.action_size, inputs)
+    bonus = None
+    if config.intrinsic.bonus != "none":
+        setting = Setting(
+            observation_size=len(phi.names),
+            action_size=env.action_size,
+            scale=_units(config, grid, len(phi.names)),
+            learning_rate=config.learner.learning_rate,
+            num_cells=grid.num_cells,
+            state_size=num_seen - size,
+            skill_size=size,
+            hidden_size=config.learner.hidden_size,
+        )
+        bonus = intrinsic.make(config.intrinsic.bonus, setting)
+    found = Components(config, env, grid, entry.torso, num_seen, sac, phi, bonus)
+    return with_task(found, config.downstream.task)
 
 
 @functools.lru_cache(maxsize=8)

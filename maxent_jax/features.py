@@ -61,12 +61,15 @@ def raw_projection(num_inputs: int) -> np.ndarray:
     return generator.standard_normal((num_inputs, NUM_PROJECTIONS))
 
 
-def make_feature_map(env_name: str) -> Features:
+def make_feature_map(env_name: str, num_dims: int | None = None) -> Features:
     """Returns the feature map of an environment: its own, else its table's, else the default.
 
     The default keeps the first two entries of the observation and projects the others. The
     projections of standard normal entries are standard normal.
 
+    Args:
+      env_name: the name of the environment.
+      num_dims: D; if left out, it is traced, which takes seconds in environments of brax.
     Raises:
       ConfigError: the environment is unknown.
     """
@@ -75,7 +78,7 @@ def make_feature_map(env_name: str) -> Features:
         return own
     path = resources.files("maxent_jax.envs") / "tables" / f"features_{env_name}.json"
     if not path.is_file():
-        return _default(observation_size(envs.make(env_name)))
+        return _default(num_dims or observation_size(envs.make(env_name)))
     table = json.loads(path.read_text(encoding="utf-8"))
     return FeatureMap(
         coordinates=tuple(table["coordinates"]),
