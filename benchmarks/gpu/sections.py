@@ -59,11 +59,6 @@ def device(session: Session) -> Measure:
 
 def neighbors(session: Session) -> Measure:
     """Measures our search, in XLA and in CUDA if built, and the expanded square with top_k."""
-
-    def scan(search, queries, points):
-        step = lambda carry, queries: (carry, search(queries, points))
-        return jax.lax.scan(step, None, queries)[1]
-
     searches = {"maxent_jax": knn.ours, "jax.lax.top_k": knn.top_k}
     if native.cuda() and jax.default_backend() == "gpu":
         searches["maxent_jax in CUDA"] = knn.in_cuda
@@ -78,9 +73,8 @@ def neighbors(session: Session) -> Measure:
             parted = queries
             if search is knn.top_k and num_sets == 1 and num_queries > 1000:
                 parted = queries.reshape(-1, 1000, queries.shape[-1])
-            function = lambda q, p, search=search: scan(search, q, p)
             name = f"kNN {num_queries:,} x {num_points:,}, {who}"
-            program = session.compile(name, function, parted, points)
+            program = session.compile(name, functools.partial(knn.scan, search), parted, points)
             programs.append((who, num_queries, num_sets, (parted, points), program))
 
     def measure() -> Iterator[Row]:
