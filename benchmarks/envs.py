@@ -84,6 +84,31 @@ def scan(env: MujocoEnv, starts: Any, actions: jax.Array) -> tuple[Any, jax.Arra
     return jax.lax.scan(step, starts, actions)
 
 
+def begin_episodes(
+    env: base.Env, num_envs: int, num_steps: int, key: jax.Array
+) -> tuple[base.Episodes, jax.Array, jax.Array]:
+    """Returns N episodes, random actions [T, N, A] and keys [T], the inputs of `step_episodes`."""
+    key_init, key_act, key_step = jax.random.split(key, 3)
+    shape = (num_steps, num_envs, env.action_size)
+    return (
+        base.init(env, num_envs, Config.environment.num_starts, key_init),
+        jax.random.uniform(key_act, shape, minval=-1, maxval=1),
+        jax.random.split(key_step, num_steps),
+    )
+
+
+def step_episodes(
+    env: base.Env, episodes: base.Episodes, actions: jax.Array, keys: jax.Array
+) -> base.Episodes:
+    """Returns the episodes after T steps as in training: those that end begin again."""
+
+    def step(episodes, inputs):
+        action, key = inputs
+        return base.step(env, episodes, action, Config.environment.episode_length, key)[0], None
+
+    return jax.lax.scan(step, episodes, (actions, keys))[0]
+
+
 def ours(workload: Workload, repeats: int) -> Measurement:
     inputs = workload.starts, jnp.asarray(workload.actions)
     program, compile_seconds = common.compiled(functools.partial(scan, workload.env), *inputs)
@@ -94,24 +119,13 @@ def ours(workload: Workload, repeats: int) -> Measurement:
 
 
 def with_episodes(workload: Workload, repeats: int) -> Measurement:
-    """Measures ours as in training: an episode that ends is followed by a new one."""
-    actions = jnp.asarray(workload.actions)
-    keys = jax.random.split(jax.random.key(SEED), len(actions))
-
-    def run(episodes, actions, keys):
-        def step(episodes, inputs):
-            return base.step(
-                workload.env, episodes, inputs[0], Config.environment.episode_length, inputs[1]
-            )
-
-        _, transitions = jax.lax.scan(step, episodes, (actions, keys))
-        return transitions.next_observation
-
-    key = jax.random.key(SEED)
-    init = jax.jit(base.init, static_argnums=(0, 1, 2))
-    episodes = init(workload.env, actions.shape[1], Config.environment.num_starts, key)
-    program, _ = common.compiled(run, episodes, actions, keys)
-    seconds = common.median_seconds(lambda: program(episodes, actions, keys), repeats)
+    """Measures ours as in training, with episodes that end."""
+    num_steps, num_envs, _ = workload.actions.shape
+    begin = jax.jit(functools.partial(begin_episodes, workload.env, num_envs, num_steps))
+    episodes, _, keys = begin(jax.random.key(SEED))
+    inputs = episodes, jnp.asarray(workload.actions), keys
+    program, _ = common.compiled(functools.partial(step_episodes, workload.env), *inputs)
+    seconds = common.median_seconds(lambda: program(*inputs), repeats)
     return Measurement(workload.num_steps / seconds, None, {})
 
 

@@ -25,10 +25,10 @@ from jax.experimental import topologies
 from jax.sharding import NamedSharding, PartitionSpec
 
 from benchmarks import common, sac
+from benchmarks.envs import begin_episodes, step_episodes
 from maxent_jax import algorithm, envs
-from maxent_jax.config import Config, preset
+from maxent_jax.config import preset
 from maxent_jax.density import knn
-from maxent_jax.envs import base
 
 # In the form in which XLA describes a device that it finds.
 H100 = """
@@ -117,18 +117,8 @@ def launches(text: str) -> tuple[int, int]:
 def steps(name: str, num_envs: int, num_steps: int) -> tuple[Callable, tuple]:
     """Returns random episodes in MJX with profile `fast`, as `benchmarks.gpu` measures them."""
     env = envs.make(name, "mjx", "fast")
-    episodes = jax.eval_shape(lambda key: base.init(env, num_envs, 4096, key), jax.random.key(0))
-
-    def run(episodes, actions, keys):
-        def step(episodes, inputs):
-            return base.step(
-                env, episodes, inputs[0], Config.environment.episode_length, inputs[1]
-            )[0], None
-
-        return jax.lax.scan(step, episodes, (actions, keys))[0]
-
-    actions = jax.ShapeDtypeStruct((num_steps, num_envs, env.action_size), jnp.float32)
-    return run, (episodes, actions, jax.random.split(jax.random.key(0), num_steps))
+    begin = functools.partial(begin_episodes, env, num_envs, num_steps)
+    return functools.partial(step_episodes, env), jax.eval_shape(begin, jax.random.key(0))
 
 
 def search(num_queries: int, num_points: int) -> tuple[Callable, tuple]:

@@ -20,7 +20,7 @@ from maxent_jax.algorithm import State, experience
 from maxent_jax.algorithm.experience import Reference
 from maxent_jax.algorithm.training import Learner
 from maxent_jax.config import Config, preset
-from maxent_jax.runs import runtime
+from maxent_jax.runs import memory, runtime
 
 ITERATIONS = (5, 20, 60)
 ROWS = (100_000, 1_000_000, 10_000_000)
@@ -74,7 +74,7 @@ def replay_rows(settings: dict[str, Any], sizes, repeats: int) -> Iterator[dict[
     for size in sizes:
         config = preset(**settings, replay_size=size, replay_dtype="float16", yaw_copies=0)
         programs, state = algorithm.programs(config), algorithm.start(config)
-        gigabytes = replay.num_bytes(state.learner.replay) / 1e9
+        gigabytes = memory.nbytes(state.learner.replay) / 1e9
         full = replay.ring_of(config, full=True)
         state = state._replace(learner=state.learner._replace(replay=full))
         begin, state = common.continued_seconds(programs.begin, state, repeats)

@@ -5,6 +5,7 @@ Gaussian; --run adds states that the mixture of a run visits. Our search include
 preparation. A peer's index is timed separately, and a second rate includes it.
 """
 
+import functools
 import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -112,6 +113,12 @@ def _everyone(queries, points):
     return queries, points, exclude, labels, jnp.int32(len(points))
 
 
+def scan(search: Search, queries: jax.Array, points: jax.Array) -> jax.Array:
+    """Searches for each set of queries in turn, [L, B, F] and [M, F] -> [L, B, k]."""
+    step = lambda carry, queries: (carry, search(queries, points))
+    return jax.lax.scan(step, None, queries)[1]
+
+
 def alone(search: Search, problem: Problem, repeats: int) -> Measurement:
     queries, points = jnp.asarray(problem.queries[0]), jnp.asarray(problem.points)
     program, compile_seconds = common.compiled(search, queries, points)
@@ -123,12 +130,7 @@ def alone(search: Search, problem: Problem, repeats: int) -> Measurement:
 def in_scan(search: Search, problem: Problem, repeats: int) -> Measurement:
     """Measures a search as in training: in a larger program, with other queries at each step."""
     queries, points = jnp.asarray(problem.queries), jnp.asarray(problem.points)
-
-    def scan(queries, points):
-        step = lambda carry, queries: (carry, search(queries, points))
-        return jax.lax.scan(step, None, queries)[1]
-
-    program, compile_seconds = common.compiled(scan, queries, points)
+    program, compile_seconds = common.compiled(functools.partial(scan, search), queries, points)
     seconds = common.median_seconds(lambda: program(queries, points), repeats) / len(queries)
     found = np.asarray(program(queries, points)[0])
     return Measurement(seconds, found, {"compile_seconds": compile_seconds})

@@ -1,7 +1,8 @@
 """Which settings take Ant farthest? Preset `quick` with one change at a time.
 
 Each run is the command `train` in its own process, with its share of the cores. As soon as it ends,
-its row is written to the file given by --out. Runs whose row is already there are skipped.
+its row is written to the file given by --out. Runs whose row is already there are skipped; a file
+with rows of other settings is refused.
 """
 
 import json
@@ -20,6 +21,7 @@ from matplotlib import colormaps
 from matplotlib.figure import Figure
 
 from benchmarks import common
+from maxent_jax.config import preset
 from maxent_jax.runs import files
 
 # The changes of each regime to the preset.
@@ -117,15 +119,21 @@ def run(name: str, seed: int, base: dict[str, Any], cores: set[int]) -> dict[str
     return {"benchmark": "learning", "regime": name, "changes": changes, "seed": seed} | columns
 
 
-def study(names, seeds, base, jobs: int, out: Path) -> Iterator[dict[str, Any]]:
+def held_by(out: Path, base: dict[str, Any]) -> dict[str, Any] | None:
+    """Returns the content of --out, without rows if it is new; None if its settings were others."""
+    # All of the preset's: it may have changed since.
+    settings = files.jsonable(preset(base["preset"], **base).flat())
+    if not out.exists():
+        return {"base": settings, "rows": []}
+    held = json.loads(out.read_text(encoding="utf-8"))
+    same = held.get("base") == settings
+    same = same and all(row["changes"] == REGIMES.get(row["regime"]) for row in held["rows"])
+    return held if same else None
+
+
+def study(names, seeds, base, jobs: int, out: Path, held) -> Iterator[dict[str, Any]]:
     """Yields rows as runs end, `jobs` runs in parallel; writes each row before it yields it."""
-    kept = (
-        json.loads(out.read_text(encoding="utf-8")) if out.exists() else {"base": base, "rows": []}
-    )
-    done = kept["rows"]
-    stale = [row["regime"] for row in done if row["changes"] != REGIMES.get(row["regime"])]
-    if kept["base"] != base or stale:
-        raise ValueError(f"{out} holds rows of other settings: choose another --out")
+    done = held["rows"]
     missing = [
         (name, seed)
         for name in names
@@ -153,7 +161,7 @@ def study(names, seeds, base, jobs: int, out: Path) -> Iterator[dict[str, Any]]:
                 continue
             row = future.result()
             done.append(row)
-            files.write_json(out, {"base": base, "rows": done})
+            files.write_json(out, held)
             yield row
     if failed:
         raise RuntimeError(f"{failed} runs failed; the rows of the others are in {out}")
@@ -201,11 +209,13 @@ def main() -> None:
         args.regimes, args.seeds = ["linear reward"], [0]
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "toy.json" if args.toy else args.out
+        held = held_by(out, base)
+        if held is None:
+            flags.error(f"{out} holds rows of other settings: choose another --out.")
         out.parent.mkdir(parents=True, exist_ok=True)
-        for row in study(args.regimes, args.seeds, base, args.jobs, out):
+        for row in study(args.regimes, args.seeds, base, args.jobs, out, held):
             common.emit(row)
-        every = json.loads(out.read_text(encoding="utf-8"))["rows"]
-        draw(every, out.with_suffix(".png"))
+        draw(held["rows"], out.with_suffix(".png"))
 
 
 if __name__ == "__main__":

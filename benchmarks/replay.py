@@ -16,17 +16,13 @@ from maxent_jax.algorithm import experience
 from maxent_jax.algorithm.experience import Reference
 from maxent_jax.config import Config, preset
 from maxent_jax.config.registry import MUJOCO_ENVS
+from maxent_jax.runs import memory
 from maxent_jax.sac import replay
 from maxent_jax.sac.replay import Replay
 from maxent_jax.types import Transition
 
 CAPACITY = 1_000_000
 NUM_INSERTS = 100
-
-
-def num_bytes(tree: Any) -> int:
-    """Returns the bytes of all arrays of a tree."""
-    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
 def both_observations(config: Config) -> int:
@@ -99,7 +95,7 @@ def measure(env: str, capacity: int, repeats: int) -> Iterator[dict[str, Any]]:
         config = preset("quick", env=env, **settings)
         ring = jax.eval_shape(lambda c=config: experience.init(components.make(c)))
         assert replay.capacity_of(ring) == capacity
-        size = num_bytes(ring)
+        size = memory.nbytes(ring)
         empty, full = (insert_seconds(config, full, repeats) for full in (False, True))
         yield {
             "benchmark": "replay",

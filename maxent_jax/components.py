@@ -1,22 +1,21 @@
 """The components of a config: what it makes once and every step uses."""
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from maxent_jax import envs, features, intrinsic, tasks
+from maxent_jax import envs, intrinsic, tasks
 from maxent_jax.config import Config, registry
 from maxent_jax.config import tasks as task_names
 from maxent_jax.density.histogram import Grid
+from maxent_jax.envs import skills
 from maxent_jax.envs.base import Env
-from maxent_jax.envs.skills import WithSkill
 from maxent_jax.envs.task import observation_size
 from maxent_jax.envs.torso import Torso
 from maxent_jax.features import make_feature_map
-from maxent_jax.intrinsic import Bonus
+from maxent_jax.intrinsic import Bonus, Setting
 from maxent_jax.sac import agent
 from maxent_jax.types import Features
 
@@ -47,42 +46,49 @@ def make(config: Config) -> Components:
 
 @functools.lru_cache(maxsize=8)
 def _make(config: Config) -> Components:
+    registry.in_use.update({("environment", config.env), ("bonus", config.intrinsic.bonus)})
     with jax.ensure_compile_time_eval():  # the first call may come during a trace
-        made_of = {("environment", config.env), ("bonus", config.intrinsic.bonus)}
-        registry.in_use.update(made_of)
-        entry = envs.entry(config.env)
-        deviations: dict[str, Any] = {}
-        if registry.environment(config.env).is_robot:
-            deviations = {name: config[name] for name in envs.DEVIATIONS}
-        env = entry.make(config.environment.backend, config.environment.physics, **deviations)
-        phi = make_feature_map(config.env)
-        grid = entry.grid
-        if size := config.environment.skill_size:
-            phi = features.of_leading(phi, observation_size(env))
-            if grid.transform:
-                grid = grid._replace(transform=_without_skill(grid.transform, size))
-            env = WithSkill(env, size)
-        num_dims = num_seen = observation_size(env)
-        inputs = lambda observation: observation
-        if config.learner.policy_inputs == "heading":
-            assert entry.torso is not None  # checked by Config
-            inputs, num_seen = entry.torso.heading_inputs, entry.torso.num_seen
-        sac = agent.make(config, num_dims, env.action_size, inputs)
-        bonus = None
-        if config.intrinsic.bonus != "none":
-            bonus = intrinsic.make(
-                config.intrinsic.bonus,
-                len(phi.names),
-                env.action_size,
-                _units(config, entry.grid, len(phi.names)),
-                config.learner.learning_rate,
-                entry.grid.num_cells,
-                num_seen - config.environment.skill_size,
-                config.environment.skill_size,
-                config.learner.hidden_size,
-            )
-        found = Components(config, env, grid, entry.torso, num_seen, sac, phi, bonus)
-        return with_task(found, config.downstream.task)
+        env = _make_env(config)
+    num_dims = observation_size(env)  # outside, where no operation of a reset is compiled
+    with jax.ensure_compile_time_eval():
+        return _make_around(config, env, num_dims)
+
+
+def _make_env(config: Config) -> Env:
+    deviations: dict[str, Any] = {}
+    if registry.environment(config.env).is_robot:
+        deviations = {name: config[name] for name in envs.DEVIATIONS}
+    own = config.environment
+    return envs.entry(config.env).make(own.backend, own.physics, **deviations)
+
+
+def _make_around(config: Config, env: Env, num_dims: int) -> Components:
+    """The components, given the environment without skills, whose states are [num_dims]."""
+    entry = envs.entry(config.env)
+    phi, grid = make_feature_map(config.env, num_dims), entry.grid
+    if size := config.environment.skill_size:
+        env, phi = skills.WithSkill(env, size), skills.BareFeatures(phi, size)
+        grid, num_dims = skills.bare_grid(grid, size), num_dims + size
+    num_seen, inputs = num_dims, lambda observation: observation
+    if config.learner.policy_inputs == "heading":
+        assert entry.torso is not None  # checked by Config
+        inputs, num_seen = entry.torso.heading_inputs, entry.torso.num_seen
+    sac = agent.make(config, num_dims, env.action_size, inputs)
+    bonus = None
+    if config.intrinsic.bonus != "none":
+        setting = Setting(
+            observation_size=len(phi.names),
+            action_size=env.action_size,
+            scale=_units(config, grid, len(phi.names)),
+            learning_rate=config.learner.learning_rate,
+            num_cells=grid.num_cells,
+            state_size=num_seen - size,
+            skill_size=size,
+            hidden_size=config.learner.hidden_size,
+        )
+        bonus = intrinsic.make(config.intrinsic.bonus, setting)
+    found = Components(config, env, grid, entry.torso, num_seen, sac, phi, bonus)
+    return with_task(found, config.downstream.task)
 
 
 @functools.lru_cache(maxsize=8)
@@ -93,23 +99,9 @@ def with_task(components: Components, name: str) -> Components:
     task = tasks.make(name, components.config.env, components.env)
     size = components.config.environment.skill_size
     if size and task.reward:
-        task = task._replace(reward=_paid_without_skill(task.reward, size))
+        task = task._replace(reward=skills.bare_reward(task.reward, size))
     registry.in_use.add(("task", name))
     return components._replace(task=task)
-
-
-def _without_skill(function: Callable[[jax.Array], jax.Array], size: int) -> Callable:
-    """The function of states [..., D], for states [..., D + size] that end with a skill."""
-    return lambda states: function(states[..., :-size])
-
-
-def _paid_without_skill(reward: tasks.Reward, size: int) -> tasks.Reward:
-    """The same for the reward of a transition."""
-
-    def paid(observation, action, next_observation):
-        return reward(observation[..., :-size], action, next_observation[..., :-size])
-
-    return paid
 
 
 def _units(config: Config, grid: Grid, num_features: int) -> jax.Array:

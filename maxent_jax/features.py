@@ -55,38 +55,21 @@ class FeatureMap:
         return jnp.concatenate([kept, projected], axis=-1)
 
 
-@dataclasses.dataclass(frozen=True)
-class _OfLeading:
-    """A feature map of the first entries of an observation."""
-
-    phi: Features
-    size: int
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.phi.names
-
-    def __call__(self, observation: jax.Array, /) -> jax.Array:
-        return self.phi(observation[..., : self.size])
-
-
-def of_leading(phi: Features, size: int) -> Features:
-    """Returns the feature map that sees only the first `size` entries of an observation."""
-    return _OfLeading(phi, size)
-
-
 def raw_projection(num_inputs: int) -> np.ndarray:
     """Returns [num_inputs, 5] float64 standard normal, always the same. Source: the paper, §5.1."""
     generator = np.random.default_rng(PROJECTION_SEED)
     return generator.standard_normal((num_inputs, NUM_PROJECTIONS))
 
 
-def make_feature_map(env_name: str) -> Features:
+def make_feature_map(env_name: str, num_dims: int | None = None) -> Features:
     """Returns the feature map of an environment: its own, else its table's, else the default.
 
     The default keeps the first two entries of the observation and projects the others. The
     projections of standard normal entries are standard normal.
 
+    Args:
+      env_name: the name of the environment.
+      num_dims: D; if left out, it is traced, which takes seconds in environments of brax.
     Raises:
       ConfigError: the environment is unknown.
     """
@@ -95,7 +78,7 @@ def make_feature_map(env_name: str) -> Features:
         return own
     path = resources.files("maxent_jax.envs") / "tables" / f"features_{env_name}.json"
     if not path.is_file():
-        return _default(observation_size(envs.make(env_name)))
+        return _default(num_dims or observation_size(envs.make(env_name)))
     table = json.loads(path.read_text(encoding="utf-8"))
     return FeatureMap(
         coordinates=tuple(table["coordinates"]),

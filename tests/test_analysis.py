@@ -133,6 +133,18 @@ def test_the_occupancy_of_paths_is_that_which_they_came_from(run, visited):
         np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-6)
 
 
+def test_the_mixtures_cells_are_those_of_numpys_histogram(run, visited):
+    grid = run.components.grid
+    expected, *_ = np.histogram2d(
+        *np.asarray(visited.states)[:, :2].T,
+        bins=grid.bins,
+        range=list(zip(grid.low, grid.high, strict=True)),
+        weights=np.asarray(visited.weight),
+    )
+    # Derived: sums of at most 600 float32 weights, each rounded by 2^-24 of the sum.
+    np.testing.assert_allclose(run.mixture_cells(visited), expected, rtol=1e-4)
+
+
 def test_distances_of_ends_are_taken_from_each_start(run):
     states = np.zeros((6, 100, 29), np.float32)
     states[:, :, :2] = [1.0, -2.0]

@@ -9,6 +9,7 @@ import pytest
 
 import maxent_jax
 from maxent_jax.analysis import dataset_files
+from maxent_jax.commands import dataset
 from maxent_jax.errors import SaveError
 from maxent_jax.runs import files
 
@@ -39,6 +40,10 @@ def expected(run):
 def episodes_of(rows):
     ends = np.flatnonzero(rows["terminals"] | rows["timeouts"]) + 1
     return np.split(np.arange(len(rows["policy"])), ends[:-1])
+
+
+def test_the_command_checks_for_the_formats_that_can_be_written():
+    assert {*dataset.FORMATS} == {*dataset_files.WRITERS}
 
 
 def test_parts_are_the_arrays_of_a_dataset_in_memory(written, expected):

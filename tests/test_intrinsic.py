@@ -98,7 +98,7 @@ def nearest(points, k):
 
 @functools.cache
 def made(name):
-    bonus = intrinsic.make(name, D, A, jnp.asarray(SCALE), RATE, CELLS, D, 2)
+    bonus = intrinsic.make(name, setting_with_skills())
 
     def step(state, batch, key):
         state, reward = bonus.reward(state, batch)
@@ -167,11 +167,11 @@ class TestEveryBonus:
 
 def test_a_name_a_scale_or_a_batch_that_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="unknown bonus 'curiosity': did you mean 'rise'"):
-        intrinsic.make("curiosity", D, A, jnp.ones(D), RATE, CELLS)
+        intrinsic.make("curiosity", setting())
     with pytest.raises(ValueError, match=r"scale has shape \(2,\), but must be \(3,\)"):
-        intrinsic.make("rnd", D, A, jnp.ones(2), RATE, CELLS)
+        intrinsic.make("rnd", setting(scale=SCALE[:2]))
     for name, least in (("re3", 3), ("rise", 5), ("renyi", 5), ("apt", 12), ("vcse", 12)):
-        bonus = intrinsic.make(name, D, A, jnp.ones(D), RATE, CELLS)
+        bonus = intrinsic.make(name, setting())
         state = jax.eval_shape(bonus.init, KEY)
         jax.eval_shape(bonus.reward, state, steps_of(size=least + 1))
         with pytest.raises(ValueError, match=f"too small for {least} neighbours"):
@@ -927,7 +927,7 @@ def test_proto_descends_the_cross_entropy_with_its_assignment_held_fixed():
 
 
 def test_the_published_reward_of_h_by_hand():
-    bonus = intrinsic.make("histogram", D, A, jnp.ones(D), RATE, CELLS)
+    bonus = intrinsic.make("histogram", setting())
     state = bonus.init(KEY)
     assert (bonus.reward(state, steps_of())[1] == 0).all()  # before there is a mixture
     share = jnp.array([[0.5, 0.25, 0.0], [0.0, 0.125, 0.0]])  # and an eighth off the grid

@@ -1,7 +1,9 @@
 """Estimates of memory, held against the states themselves and against XLA's own account."""
 
 import jax
+import jax.numpy as jnp
 import pytest
+import user_module
 
 from maxent_jax import algorithm
 from maxent_jax.config import from_flat, preset
@@ -96,6 +98,18 @@ def test_the_states_of_cells_are_counted(monkeypatch):
 def test_sizes_that_nothing_can_count_are_refused_before_jax_is_asked(name, size):
     with pytest.raises(ConfigError, match=f"{name.replace('_', '-')} is {size}, but must be"):
         from_flat({name: size})
+
+
+def test_no_environment_is_computed_for_the_estimate(monkeypatch):
+    constants, reset = [], user_module.Point.reset
+
+    def watched(point, rng):
+        constants.append(jnp.zeros(()))
+        return reset(point, rng)
+
+    monkeypatch.setattr(user_module.Point, "reset", watched)
+    memory.on_a_device(preset("smoke", env="user:point", episode_length=41))
+    assert constants and all(isinstance(x, jax.core.Tracer) for x in constants)
 
 
 def test_devices_share_what_they_can(smoke):

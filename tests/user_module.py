@@ -40,7 +40,6 @@ def far_from_origin(setting):
     return intrinsic.Bonus(
         init=lambda key: jnp.zeros(()),
         reward=lambda state, steps: (state, jnp.sum(steps.next_observation**2, axis=-1)),
-        learn=lambda state, steps, key: (state, {}),
     )
 
 

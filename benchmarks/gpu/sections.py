@@ -23,8 +23,7 @@ from benchmarks import common, knn, sac
 from benchmarks.gpu.session import Measure, Row, Session
 from maxent_jax import algorithm, envs, native
 from maxent_jax.algorithm.experience import Reference
-from maxent_jax.config import Config, preset
-from maxent_jax.envs import base
+from maxent_jax.config import preset
 from maxent_jax.runs import files
 
 EVALUATION = 0.2  # share of the time, to stop the run and to play its policies on the host
@@ -60,11 +59,6 @@ def device(session: Session) -> Measure:
 
 def neighbors(session: Session) -> Measure:
     """Measures our search, in XLA and in CUDA if built, and the expanded square with top_k."""
-
-    def scan(search, queries, points):
-        step = lambda carry, queries: (carry, search(queries, points))
-        return jax.lax.scan(step, None, queries)[1]
-
     searches = {"maxent_jax": knn.ours, "jax.lax.top_k": knn.top_k}
     if native.cuda() and jax.default_backend() == "gpu":
         searches["maxent_jax in CUDA"] = knn.in_cuda
@@ -79,9 +73,8 @@ def neighbors(session: Session) -> Measure:
             parted = queries
             if search is knn.top_k and num_sets == 1 and num_queries > 1000:
                 parted = queries.reshape(-1, 1000, queries.shape[-1])
-            function = lambda q, p, search=search: scan(search, q, p)
             name = f"kNN {num_queries:,} x {num_points:,}, {who}"
-            program = session.compile(name, function, parted, points)
+            program = session.compile(name, functools.partial(knn.scan, search), parted, points)
             programs.append((who, num_queries, num_sets, (parted, points), program))
 
     def measure() -> Iterator[Row]:
@@ -151,26 +144,13 @@ def env_steps(names: tuple[str, ...], sizes: tuple[int, ...], session: Session) 
     programs = []
     for name, num_envs in chosen:
         env = envs.make(name) if session.toy else envs.make(name, "mjx", "fast")
-
-        def run(episodes, key, env=env, num_envs=num_envs):
-            def step(carry, key):
-                episodes, ends = carry
-                key_act, key_env = jax.random.split(key)
-                shape = (num_envs, env.action_size)
-                action = jax.random.uniform(key_act, shape, minval=-1, maxval=1)
-                episodes, seen = base.step(
-                    env, episodes, action, Config.environment.episode_length, key_env
-                )
-                return (episodes, ends + seen.terminated.sum()), None
-
-            keys = jax.random.split(key, RATE_STEPS)
-            return jax.lax.scan(step, (episodes, 0), keys)[0]
-
-        key = jax.random.key(0)
-        init = jax.jit(lambda key, env=env, n=num_envs: base.init(env, n, 4096, key))
-        episodes = jax.block_until_ready(init(key))
-        program = session.compile(f"{name}, {num_envs:,} envs", run, episodes, key)
-        programs.append((name, num_envs, (episodes, key), program))
+        begin = jax.jit(
+            functools.partial(benchmarks.envs.begin_episodes, env, num_envs, RATE_STEPS)
+        )
+        inputs = jax.block_until_ready(begin(jax.random.key(0)))
+        run = functools.partial(benchmarks.envs.step_episodes, env)
+        program = session.compile(f"{name}, {num_envs:,} envs", run, *inputs)
+        programs.append((name, num_envs, inputs, program))
 
     def measure() -> Iterator[Row]:
         for name, num_envs, inputs, future in programs:

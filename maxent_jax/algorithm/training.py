@@ -15,6 +15,7 @@ from maxent_jax.density import histogram, plane, reservoir
 from maxent_jax.density.reservoir import Reservoir
 from maxent_jax.envs import base
 from maxent_jax.envs.base import Episodes
+from maxent_jax.envs.skills import without_skill
 from maxent_jax.intrinsic import Steps
 from maxent_jax.mixture.occupancy import Occupancy
 from maxent_jax.sac import agent as sac_agent
@@ -498,8 +499,8 @@ def _states(components: Components, drawn: Experience) -> dict[str, jax.Array]:
     if not size:
         return {}
     return {
-        "state": drawn.observation[..., :-size],
-        "next_state": drawn.next_observation[..., :-size],
+        "state": without_skill(drawn.observation, size),
+        "next_state": without_skill(drawn.next_observation, size),
         "skill": drawn.observation[..., -size:],
     }
 

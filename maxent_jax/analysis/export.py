@@ -10,7 +10,7 @@ from maxent_jax.sac.agent import Policy, Sac
 PLATFORMS = ("cpu", "cuda", "tpu")
 
 
-def policy(sac: Sac, policy: Policy, deterministic: bool = False) -> export.Exported:
+def policy(sac: Sac, trained: Policy, deterministic: bool = False) -> export.Exported:
     """Exports a policy with its weights, for any number of states, to any of PLATFORMS.
 
     The result's `call` takes (states [b, D] float32, typed key), or only states if it is
@@ -19,17 +19,17 @@ def policy(sac: Sac, policy: Policy, deterministic: bool = False) -> export.Expo
     jax promises compatibility for six months.
 
     Args:
-      policy: the weights, and the moments of the inputs.
+      trained: the policy's weights, and the moments of its inputs.
       deterministic: return the tanh of the Gaussian's mean instead of a draw.
     """
     states = jax.ShapeDtypeStruct((*export.symbolic_shape("b"), sac.observation_size), jnp.float32)
     key = jax.ShapeDtypeStruct((), jax.random.key(0).dtype)
 
     def draw(states, key):
-        return agent.act(sac, policy, states, key)
+        return agent.act(sac, trained, states, key)
 
     def mean(states):
-        return agent.act(sac, policy, states, jax.random.key(0), deterministic=True)
+        return agent.act(sac, trained, states, jax.random.key(0), deterministic=True)
 
     if deterministic:
         return export.export(jax.jit(mean), platforms=PLATFORMS)(states)

@@ -217,6 +217,12 @@ class Run:
         measured = occupancy.measures(self.components, visited, jax.random.key(seed))
         return {name: value.item() for name, value in measured.items()}
 
+    @in_32_bits
+    def mixture_cells(self, visited: Occupancy) -> np.ndarray:
+        """Returns the share of the mixture's states in each cell of the grid, [bins, bins]."""
+        grid = self.components.grid
+        return np.asarray(histogram.count(visited.states, grid, visited.weight))
+
     @property
     def _components_by_policy(self) -> Components:
         """The components with which policies play equally often, whatever the config says."""
@@ -284,7 +290,7 @@ def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> R
     rows = checkpoint.read_progress(directory, name)[0].rows
     if config.num_seeds > 1:
         results = jax.tree.map(lambda x: x[seed_index], results)
-        rows = [_of_seed(row, seed_index) for row in rows]
+        rows = [files.of_seed(row, seed_index) for row in rows]
     return Run(
         path=directory,
         config=config,
@@ -327,10 +333,6 @@ def _scalar_columns(metrics: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         for index in np.ndindex(values.shape[1:]):
             columns["_".join([name, *map(str, index)])] = values[:, *index]
     return columns
-
-
-def _of_seed(row: dict[str, Any], index: int) -> dict[str, Any]:
-    return {k: v[index] if isinstance(v, list) else v for k, v in row.items()}
 
 
 def _column(rows: list[dict[str, Any]], name: str) -> np.ndarray:

@@ -117,8 +117,7 @@ def train(
     )
     for done in range(0, settings.num_updates, UPDATES_AT_ONCE):
         number = min(UPDATES_AT_ONCE, settings.num_updates - done)
-        steps = done + jnp.arange(number)
-        state = _updates(settings, state, seen, steps, jax.random.fold_in(key, done))
+        state = _updates(settings, state, seen, done + jnp.arange(number), key)
     return Policy(state.actor, mean, deviation)
 
 
@@ -164,7 +163,7 @@ def _networks(settings: Settings, action_size: int) -> tuple[Any, Any]:
 def _updates(
     settings: Settings, state: _State, data: _Data, steps: jax.Array, key: jax.Array
 ) -> _State:
-    """The updates of these numbers [U]."""
+    """The updates of these numbers [U], each of which is folded into the key."""
     actor, critic = _networks(settings, data.action.shape[-1])
     optimizer = optax.adam(settings.learning_rate)
 

@@ -68,7 +68,6 @@ def main(argv: Sequence[str]) -> None:
 def evaluate(arguments: Arguments) -> dict[str, Any]:
     """Returns the report as JSON-ready data, and draws the figures."""
     import jax.numpy as jnp
-    import numpy as np
 
     from maxent_jax import analysis
     from maxent_jax.density import histogram
@@ -76,8 +75,7 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
 
     run = analysis.load_run(arguments.directory, arguments.seed_index, arguments.fallback)
     visited = run.occupancy(arguments.episodes, arguments.seed)
-    cells = histogram.count(visited.states, run.components.grid, visited.weight)
-    plotting.save_all(run, np.asarray(cells), analysis.paths(visited))
+    plotting.save_all(run, visited)
     return {
         "run": str(run.path),
         "trained_with_seed": run.seed,

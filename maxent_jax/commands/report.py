@@ -140,21 +140,15 @@ def _run_section(name: str, seeds: Sequence["Run"]) -> dict[str, Any]:
 
 
 def _seed_section(run: "Run", seed_index: int, arguments: Arguments) -> dict[str, Any]:
-    import jax.numpy as jnp
-    import numpy as np
-
     from maxent_jax import analysis
-    from maxent_jax.density import histogram
     from maxent_jax.visual import plotting, tables
 
     visited = run.occupancy(arguments.episodes, arguments.seed)
-    paths = analysis.paths(visited)
-    cells = histogram.count(jnp.asarray(visited.states), run.components.grid, visited.weight)
     return {
         "seed": run.seed,
         "curves": _svg(plotting.curves(run)) if run.metrics else None,
-        "occupancy": _svg(plotting.occupancy_map(run, np.asarray(cells))),
-        "fireworks": _svg(plotting.fireworks(run, paths)),
+        "occupancy": _svg(plotting.occupancy_map(run, run.mixture_cells(visited))),
+        "fireworks": _svg(plotting.fireworks(run, analysis.paths(visited))),
         "strip": _strip(run, seed_index),
         "iterations": tables.iterations(run),
         "policies": tables.policies(run, visited, arguments.seed),

@@ -2,12 +2,10 @@
 
 from collections.abc import Callable
 
-import jax
-
 from maxent_jax.config import registry
 from maxent_jax.config.registry import BonusRow, resolve
 from maxent_jax.errors import ConfigTypeError
-from maxent_jax.intrinsic.protocol import HIDDEN_SIZE, Bonus, Episodic, Setting, Steps
+from maxent_jax.intrinsic.protocol import Bonus, Episodic, Setting, Steps
 
 __all__ = ["Bonus", "Episodic", "Setting", "Steps", "make", "register"]
 
@@ -29,38 +27,17 @@ def register(name: str, make: Callable[[Setting], Bonus], num_neighbors: int = 0
     registry.register_bonus(name, BonusRow(make, num_neighbors))
 
 
-def make(
-    name: str,
-    observation_size: int,
-    action_size: int,
-    scale: jax.Array,
-    learning_rate: float,
-    num_cells: int,
-    state_size: int = 0,
-    skill_size: int = 0,
-    hidden_size: int = HIDDEN_SIZE,
-) -> Bonus:
+def make(name: str, setting: Setting) -> Bonus:
     """Makes the bonus of a name.
 
     Args:
       name: a row of config.registry.BONUSES.
-      observation_size: D.
-      action_size: A.
-      scale: [D] positive, the unit of each entry: networks and distances see observation / scale.
-      learning_rate: of Adam, if the bonus learns by gradients.
-      num_cells: of the grid on which coverage is counted.
-      state_size: I, of what the networks see without the skill.
-      skill_size: Z.
-      hidden_size: of the actor and the critics.
+      setting: the sizes and units of the run.
     Raises:
       ValueError: the name is unknown, or the scale is not [D].
     """
     row = registry.bonus(name)
-    if scale.shape != (observation_size,):
-        raise ValueError(f"scale has shape {scale.shape}, but must be ({observation_size},)")
-    return resolve(row.make)(
-        Setting(
-            *(observation_size, action_size, scale, learning_rate, num_cells),
-            *(state_size, skill_size, hidden_size),
-        )
-    )
+    size = setting.observation_size
+    if setting.scale.shape != (size,):
+        raise ValueError(f"scale has shape {setting.scale.shape}, but must be ({size},)")
+    return resolve(row.make)(setting)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from maxent_jax.intrinsic.protocol import Bonus, Setting, Steps, no_learning
+from maxent_jax.intrinsic.protocol import Bonus, Setting, Steps
 
 
 class State(NamedTuple):
@@ -25,12 +25,7 @@ class State(NamedTuple):
 
 def make(setting: Setting) -> Bonus:
     """The reward 1/(p + ε), positive and at most sqrt(cells)."""
-    return Bonus(
-        init=functools.partial(init, setting.num_cells),
-        reward=reward,
-        learn=no_learning,
-        refresh=refresh,
-    )
+    return Bonus(functools.partial(init, setting.num_cells), reward, refresh=refresh)
 
 
 def init(num_cells: int, key: jax.Array) -> State:

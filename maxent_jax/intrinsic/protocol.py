@@ -52,6 +52,12 @@ class Episodic(NamedTuple):
     """
 
 
+def _no_learning(state: State, steps: Steps, key: jax.Array) -> tuple[State, Metrics]:
+    """What a bonus does that does not learn."""
+    del steps, key
+    return state, {}
+
+
 class Bonus(NamedTuple):
     """Functions that can be jitted and mapped over seeds; a scan can carry the state."""
 
@@ -59,8 +65,8 @@ class Bonus(NamedTuple):
     """key -> state"""
     reward: Callable[[State, Steps], tuple[State, jax.Array]]
     """state, steps -> state with updated running normalisers, reward [B]"""
-    learn: Callable[[State, Steps, jax.Array], tuple[State, Metrics]]
-    """state, steps, key -> state after one step of learning; unchanged if it does not learn"""
+    learn: Callable[[State, Steps, jax.Array], tuple[State, Metrics]] = _no_learning
+    """state, steps, key -> state after one step of learning"""
     episodic: Episodic | None = None
     refresh: Callable[[State, jax.Array], State] | None = None
     """state, share [bins, bins] of the mixture's states in each cell -> state; called when an
@@ -72,13 +78,13 @@ class Bonus(NamedTuple):
 class Setting(NamedTuple):
     """The arguments from which every bonus is made."""
 
-    observation_size: int
-    action_size: int
-    scale: jax.Array  # [D] the unit of each entry of an observation
-    learning_rate: float
+    observation_size: int  # D
+    action_size: int  # A
+    scale: jax.Array  # [D] positive, the unit of each entry of an observation
+    learning_rate: float  # of Adam, if the bonus learns by gradients
     num_cells: int  # of the grid on which coverage is counted
-    state_size: int = 0  # of what the networks see, without the skill
-    skill_size: int = 0
+    state_size: int = 0  # I, of what the networks see, without the skill
+    skill_size: int = 0  # Z
     hidden_size: int = HIDDEN_SIZE  # of the actor and the critics
 
 
@@ -96,9 +102,3 @@ def no_state(key: jax.Array) -> State:
     """The `init` of a bonus without a state."""
     del key
     return ()
-
-
-def no_learning(state: State, steps: Steps, key: jax.Array) -> tuple[State, Metrics]:
-    """The `learn` of a bonus that does not learn."""
-    del steps, key
-    return state, {}

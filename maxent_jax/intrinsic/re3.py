@@ -39,11 +39,7 @@ class Re3(NamedTuple):
 def make(setting: Setting) -> Bonus:
     """Makes the bonus log(1 + distance to the third nearest), positive."""
     re3 = Re3(setting, Mlp(HIDDEN_LAYERS, HIDDEN_SIZE, EMBEDDING_SIZE))
-    return Bonus(
-        init=functools.partial(init, re3),
-        reward=functools.partial(reward, re3),
-        learn=protocol.no_learning,
-    )
+    return Bonus(init=functools.partial(init, re3), reward=functools.partial(reward, re3))
 
 
 def init(re3: Re3, key: jax.Array) -> Any:

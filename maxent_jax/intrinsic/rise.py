@@ -22,11 +22,7 @@ NUM_NEIGHBORS, ORDER = BONUSES["rise"].num_neighbors, 0.1  # k and alpha of src/
 
 def make(setting: Setting) -> Bonus:
     """Makes the bonus R^0.9, at least 0."""
-    return Bonus(
-        init=protocol.no_state,
-        reward=functools.partial(reward, setting),
-        learn=protocol.no_learning,
-    )
+    return Bonus(init=protocol.no_state, reward=functools.partial(reward, setting))
 
 
 def make_renyi(setting: Setting) -> Bonus:
@@ -34,11 +30,7 @@ def make_renyi(setting: Setting) -> Bonus:
 
     With R^(D (1 - α)) instead of R^(1 - α), RISE's reward would be its exponential, up to a factor.
     """
-    return Bonus(
-        init=protocol.no_state,
-        reward=functools.partial(renyi_reward, setting),
-        learn=protocol.no_learning,
-    )
+    return Bonus(init=protocol.no_state, reward=functools.partial(renyi_reward, setting))
 
 
 def reward(

@@ -30,11 +30,7 @@ ROWS = 256  # states measured at once, so that memory grows with B, not with its
 
 def make(setting: Setting) -> Bonus:
     """Makes the bonus ψ(n + 1) / D + log(2ε + 1e-5), nats per dimension, of either sign."""
-    return Bonus(
-        init=protocol.no_state,
-        reward=functools.partial(reward, setting),
-        learn=protocol.no_learning,
-    )
+    return Bonus(init=protocol.no_state, reward=functools.partial(reward, setting))
 
 
 def reward(setting: Setting, state: State, steps: Steps) -> tuple[State, jax.Array]:

@@ -179,6 +179,11 @@ def read_metrics(directory: Path) -> list[dict[str, Any]]:
         raise RunError(f"{path} holds a line that is not JSON.") from None
 
 
+def of_seed(row: dict[str, Any], index: int) -> dict[str, Any]:
+    """Returns a row of metrics for one seed of the run, counted from 0, of one or several."""
+    return {name: x[index] if isinstance(x, list) else x for name, x in row.items()}
+
+
 def write_metrics(directory: Path, rows: list[dict[str, Any]]) -> None:
     """Writes metrics.jsonl with exactly these rows, unless it has them already."""
     path, text = directory / METRICS, _lines(rows)

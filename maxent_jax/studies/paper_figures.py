@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from maxent_jax.analysis import load_run, paths
-from maxent_jax.density import histogram
 from maxent_jax.studies.statistics import interquartile_mean, interval_of_curves
 from maxent_jax.studies.values import RANDOM
 from maxent_jax.visual import plotting
@@ -258,9 +257,8 @@ def occupancies(directories: Mapping[str, Path]) -> Figure:
     for row, (method, directory) in zip(axes, directories.items(), strict=True):
         run = load_run(directory)
         visited = run.occupancy()
-        cells = np.asarray(histogram.count(visited.states, run.components.grid, visited.weight))
         plotting.draw_occupancy(row[0], run, run.histogram / max(run.histogram.sum(), 1))
-        plotting.draw_occupancy(row[1], run, cells)
+        plotting.draw_occupancy(row[1], run, run.mixture_cells(visited))
         plotting.draw_paths(row[2], run, paths(visited))
         for ax, what in zip(row, ("training", "mixture", "one colour per policy"), strict=True):
             ax.set_title(f"{method}: {what}")

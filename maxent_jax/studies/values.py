@@ -33,7 +33,7 @@ def read(directory: Path, cells: Sequence[Cell]) -> list[Row]:
             for index in range(cell.config.num_seeds):
                 seed = cell.config.seed + index
                 head: Row = {"env": cell.config.env, "method": cell.method, "seed": seed}
-                own = {k: v[index] if isinstance(v, list) else v for k, v in row.items()}
+                own = files.of_seed(row, index)
                 found.append(head | known(own))
                 if cell.method == first and "random_coverage" in own:
                     found.append(head | _of_random(own))

@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
-import numpy as np
 
-from maxent_jax.analysis import load_run, paths
+from maxent_jax.analysis import load_run
 from maxent_jax.config import registry
-from maxent_jax.density import histogram
 from maxent_jax.visual import plotting
 
 EPISODES_WITH_SKILLS = 16  # of each policy, so that the newest one shows skills all around
@@ -43,9 +41,5 @@ def draw_missing(directory: Path) -> None:
 def _draw(directory: Path, modules: Sequence[str] = ()) -> None:
     registry.import_modules(modules)
     run = load_run(directory)
-    if run.config.environment.skill_size:
-        visited = run.occupancy(EPISODES_WITH_SKILLS)
-    else:
-        visited = run.occupancy()
-    cells = histogram.count(visited.states, run.components.grid, visited.weight)
-    plotting.save_all(run, np.asarray(cells), paths(visited))
+    with_skills = run.config.environment.skill_size > 0
+    plotting.save_all(run, run.occupancy(EPISODES_WITH_SKILLS) if with_skills else run.occupancy())

@@ -12,10 +12,12 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 
+from maxent_jax import analysis
 from maxent_jax.analysis import Paths, Run
 from maxent_jax.config import tasks
 from maxent_jax.density import histogram
 from maxent_jax.density.histogram import Grid
+from maxent_jax.mixture.occupancy import Occupancy
 from maxent_jax.runs.files import FIGURES, whole_file
 
 COVERAGE_AXES = (
@@ -216,9 +218,13 @@ def _skill_color(angle: float) -> np.ndarray:
     return np.array(matplotlib.colormaps["hsv"](angle / (2 * np.pi) % 1.0))
 
 
-def save_all(run: Run, mixture_cells: np.ndarray, paths: Paths) -> None:
-    """Saves the three figures of a run; mixture_cells [bins, bins] as in `occupancy_map`."""
-    drawn = curves(run), occupancy_map(run, mixture_cells), fireworks(run, paths)
+def save_all(run: Run, visited: Occupancy) -> None:
+    """Saves the three figures of a run, with the states that its mixture visited."""
+    drawn = (
+        curves(run),
+        occupancy_map(run, run.mixture_cells(visited)),
+        fireworks(run, analysis.paths(visited)),
+    )
     for name, figure in zip(NAMES, drawn, strict=True):
         save(figure, run.path / FIGURES, name)
 
