@@ -21,9 +21,9 @@ jax.config.update("jax_legacy_prng_key", "error")
 # Files that take longest come first, so that no worker is left with one at the end.
 LONGEST = ("test_protocol", "test_train", "test_knn", "test_physics", "test_intrinsic")
 # Toy programs run for milliseconds and compile for seconds: they are spared most optimisations, and
-# XLA's newer code generator, which takes twice as long.
+# XLA's newer code generator, which takes twice as long. From jax 0.11 on there is no other.
 FAST = "JAX_DISABLE_MOST_OPTIMIZATIONS"
-OLDER_EMITTERS = "--xla_cpu_use_fusion_emitters=false"
+OLDER_EMITTERS = "--xla_cpu_use_fusion_emitters=false" if jax.__version_info__ < (0, 11) else ""
 
 
 def pytest_addoption(parser):
