@@ -18,7 +18,7 @@ from benchmarks import common, replay
 from maxent_jax import algorithm, components, mixture
 from maxent_jax.algorithm import State, experience
 from maxent_jax.algorithm.experience import Reference
-from maxent_jax.algorithm.training import Learner
+from maxent_jax.algorithm.learner import Learner
 from maxent_jax.config import Config, preset
 from maxent_jax.runs import memory, runtime
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from maxent_jax import envs, intrinsic, tasks
+from maxent_jax import envs, intrinsic, rewards, tasks
 from maxent_jax.config import Config, registry
 from maxent_jax.config import tasks as task_names
 from maxent_jax.density.histogram import Grid
@@ -37,6 +37,11 @@ class Components(NamedTuple):
     def in_metres(self) -> bool:
         """Whether the grid's coordinates are metres, so that unit cells mean something."""
         return registry.environment(self.config.env).in_metres
+
+    def unshaped_reward(self, distance: jax.Array) -> jax.Array:
+        """Returns r_t of states at a distance from the reference, [...] -> [...]."""
+        own = self.config.intrinsic
+        return rewards.of_distance(distance, own.reward, own.reward_distance, len(self.phi.names))
 
 
 def make(config: Config) -> Components:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from maxent_jax import algorithm, components
-from maxent_jax.algorithm import experience, training
+from maxent_jax.algorithm import experience, payment, training
 from maxent_jax.config import preset
 from maxent_jax.config.registry import BASELINES, STARTS
 from maxent_jax.density import histogram
@@ -32,7 +32,7 @@ def trained(method):
     @jax.jit
     def run(state):
         learner = state.learner._replace(
-            bonus=training.refresh_bonus(p, state.learner.bonus, visited(p, state))
+            bonus=payment.refresh_bonus(p, state.learner.bonus, visited(p, state))
         )
         step = functools.partial(training.step, p, state.method)
         return jax.lax.scan(step, learner, jax.random.split(jax.random.key(5), STEPS))
@@ -142,7 +142,7 @@ def test_a_bonus_is_shown_what_was_drawn_and_pays_before_it_learns(what):
     for key in jax.random.split(jax.random.key(5), 4):
         learner, _ = step(learner, key)
     drawn = experience.sample(p, learner.replay, learner.episodes.starts.obs, (2, 16), key)
-    bonus, paid, metrics = training._paid_by_bonus(p, learner, drawn, key)
+    bonus, paid, metrics = payment.pay_bonus(p, learner, drawn, key)
 
     rows = np.asarray(drawn.row)
     items = learner.replay.items

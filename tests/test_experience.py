@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from maxent_jax import components
-from maxent_jax.algorithm import experience, training
+from maxent_jax.algorithm import experience, payment
 from maxent_jax.algorithm.experience import Reference
 from maxent_jax.config import preset
 from maxent_jax.types import Distances, Outcomes, Transition
@@ -268,7 +268,7 @@ def test_returns_by_hand():
     taken = jnp.array([[1, 1, 1], [1, 1, 0], [1, 1, 0]], bool)
     terminated = jnp.array([[0, 0, 0], [0, 0, 0], [0, 1, 0]], bool)
     outcomes = Outcomes(None, None, None, terminated, None, taken)
-    total, beyond = training.returns(outcomes, paid, 0.5)
+    total, beyond = payment.returns(outcomes, paid, 0.5)
     np.testing.assert_allclose(total, [3, 2, 2])
     np.testing.assert_allclose(beyond, [1 / 4, 1 / 2, 0])  # one γ more in the Bellman target
 
@@ -277,5 +277,5 @@ def test_a_step_alive_is_paid_for_and_a_death_is_not():
     distances = Distances(*(jnp.ones((2, 1)) for _ in range(3)))
     terminated = jnp.array([[False], [True]])
     outcomes = Outcomes(None, None, jnp.zeros((2, 1)), terminated, distances, ~terminated)
-    without, paid = (training.reward(make(alive_bonus=b), outcomes) for b in (0.0, 0.3))
+    without, paid = (payment.intrinsic(make(alive_bonus=b), outcomes) for b in (0.0, 0.3))
     np.testing.assert_allclose(paid - without, [[0.3], [0]], atol=1e-5)

@@ -14,7 +14,8 @@ from test_checkpoint import StopAt, restored, timeless
 
 import maxent_jax
 from maxent_jax import algorithm, components, mixture
-from maxent_jax.algorithm import experience, finetune, training
+from maxent_jax.algorithm import experience, finetune, payment
+from maxent_jax.algorithm.learner import NUM_RESTARTS
 from maxent_jax.commands import train
 from maxent_jax.config import preset
 from maxent_jax.config.registry import ENVS
@@ -127,7 +128,7 @@ def test_restarts_are_states_of_successful_episodes():
     state, first = finetune.start(config, archive_of(config, [-0.1, 0.1]))
     assert first.task_return[0] == 0 and first.task_return[1] > 0
     learner, episodes = state.learner, state.learner.episodes
-    num = training.NUM_RESTARTS
+    num = NUM_RESTARTS
     assert episodes.restarts.age.shape == (min(num, config.environment.num_starts),)
     within = np.asarray(episodes.starts.obs[-episodes.restarts.age.shape[0] :])
     # The successful policy moves right by 0.02 a step, from about 0.
@@ -227,7 +228,7 @@ def test_beta_weighs_the_intrinsic_reward_and_falls(changes, expected):
         taken=number > 0,
         task=3.0 * number,
     )
-    found = training.with_task(p, learner, 5.0 * number, outcomes)
+    found = payment.with_task(p, learner, 5.0 * number, outcomes)
     np.testing.assert_allclose(found, [[expected]], rtol=1e-6)
 
 

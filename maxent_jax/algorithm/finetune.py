@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from maxent_jax import components, mixture
-from maxent_jax.algorithm import experience, loop, training
+from maxent_jax.algorithm import experience, loop
+from maxent_jax.algorithm.learner import NUM_RESTARTS, Learner, visit
 from maxent_jax.algorithm.loop import SEED_AXES, State
-from maxent_jax.algorithm.training import Learner
 from maxent_jax.components import Components
 from maxent_jax.config import Config, names
 from maxent_jax.density import reservoir
@@ -125,7 +125,7 @@ def _play(
         alive = reached.alive.reshape(-1)
         learner = learner._replace(
             history=reservoir.add(learner.history, p.phi(states), alive, key_history),
-            visits=training.visit(p, learner.visits, states, alive),
+            visits=visit(p, learner.visits, states, alive),
         )
         if fills:
             learner = learner._replace(
@@ -166,7 +166,7 @@ def _restarting(p: Components, episodes: Episodes, found: _Episode, key: jax.Arr
     equal, as when a sparse task was never solved, all episodes are alike.
     """
     key_episode, key_time, key_begin = jax.random.split(key, 3)
-    num = min(training.NUM_RESTARTS, p.config.environment.num_starts)
+    num = min(NUM_RESTARTS, p.config.environment.num_starts)
     returns = found.task_return
     least_of_best = jax.lax.top_k(returns, -(-returns.shape[0] // 10))[0][-1]
     above = jnp.where(returns >= least_of_best, returns - jnp.min(returns), 0.0)

@@ -18,9 +18,9 @@ import jax
 import jax.numpy as jnp
 
 from maxent_jax import components, mixture
-from maxent_jax.algorithm import experience, methods, training
+from maxent_jax.algorithm import experience, methods, payment, training
 from maxent_jax.algorithm.experience import Reference
-from maxent_jax.algorithm.training import Learner
+from maxent_jax.algorithm.learner import Learner, Visits, init_learner
 from maxent_jax.components import Components
 from maxent_jax.config import Config
 from maxent_jax.config.registry import CORRECTIVE, STARTS
@@ -69,7 +69,7 @@ def start(config: Config) -> State:
 @functools.partial(jax.jit, static_argnums=0)
 def _init(config: Config, method: methods.Method, key: jax.Array) -> State:
     key, key_learner = jax.random.split(key)
-    learner = training.init(components.make(config), key_learner)
+    learner = init_learner(components.make(config), key_learner)
     initial = learner.agent.parameters
     archive = mixture.append(mixture.init(initial, config.archive_size), initial)
     return State(key, jnp.zeros((), jnp.int32), method, archive, learner)
@@ -122,7 +122,7 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
         replay=replay,
         reference=reference,
         history=history,
-        bonus=training.refresh_bonus(p, learner.bonus, visited),
+        bonus=payment.refresh_bonus(p, learner.bonus, visited),
     )
     metrics = {
         "weights": weights,
@@ -282,7 +282,7 @@ def _start(
     return chosen._replace(parameters=chosen.parameters._replace(log_temperature=initial))
 
 
-def coverage(of: str, visits: training.Visits) -> Metrics:
+def coverage(of: str, visits: Visits) -> Metrics:
     """Returns coverage (cells), entropy (nats) and off-grid share; `of` begins each name."""
     on_grid = jnp.sum(visits.cells)
     return {

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from maxent_jax import mixture, rewards, rollout
+from maxent_jax import mixture, rollout
 from maxent_jax.components import Components
 from maxent_jax.config.registry import CORRECTIVE
 from maxent_jax.density import entropy, histogram, plane
@@ -245,9 +245,7 @@ def score(
         count=num_filled,
         labels=point_label,
     )[:, -1]
-    reward = rewards.of_distance(
-        distance, config.intrinsic.reward, config.intrinsic.reward_distance, points.shape[1]
-    )
+    reward = components.unshaped_reward(distance)
     alive = occupancy.alive.astype(jnp.float32)
     total = jnp.zeros(capacity).at[occupancy.policy].add(jnp.where(alive > 0, reward, 0.0))
     lived = jnp.zeros(capacity).at[occupancy.policy].add(alive)

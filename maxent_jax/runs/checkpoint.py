@@ -25,7 +25,7 @@ from orbax.checkpoint import v1 as ocp
 from maxent_jax import algorithm
 from maxent_jax.algorithm import State
 from maxent_jax.algorithm.experience import Step
-from maxent_jax.algorithm.training import Learner, Visits
+from maxent_jax.algorithm.learner import Learner, Visits
 from maxent_jax.config import Config
 from maxent_jax.envs.base import Episodes
 from maxent_jax.errors import CheckpointError, SaveError

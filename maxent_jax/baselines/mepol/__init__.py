@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from brax.envs.base import Wrapper
 
 from maxent_jax import algorithm, rollout
-from maxent_jax.algorithm.training import Visits, visit
+from maxent_jax.algorithm.learner import Visits, visit
 from maxent_jax.baselines.mepol import ascent, estimates
 from maxent_jax.baselines.mepol.ascent import Batch
 from maxent_jax.baselines.mepol.settings import Settings
