@@ -173,7 +173,16 @@ STUDIES: dict[str, Study] = {
         },
         {
             "toy": TOY._replace(num_seeds={"ant": 2}, changes={"protocol": "metra"}),
-            "cpu": Scale("quick", {"ant": 3}, {"protocol": "metra", "policy_lag": 0}),
+            "cpu": Scale(
+                "quick",
+                {"ant": 3},
+                {
+                    "protocol": "metra",
+                    "policy_lag": 0,
+                    "num_iterations": 20,
+                    "steps_per_iteration": 240_000,
+                },
+            ),
             "paper": Scale("paper", {"ant": 5, "humanoid": 5}, {"protocol": "metra"}),
         },
     ),
