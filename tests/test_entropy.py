@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.special import digamma, gamma, gammaln, polygamma
 
+from maxent_jax import mixture
 from maxent_jax.density.entropy import knn_density, knn_entropy
 
 N, K = 20_000, 3
@@ -77,21 +78,28 @@ def test_the_entropy_is_equation_6_over_neighbours_found_by_scipy(dims, k):
     np.testing.assert_allclose(knn_entropy_jit(samples, k), expected, rtol=0, atol=1e-5)
 
 
-def test_copies_with_one_label_do_not_see_each_other():
-    rng = np.random.default_rng(4)
-    distinct = rng.standard_normal((300, 2)).astype(np.float32)
-    rows = np.sort(rng.integers(300, size=500))
-    samples = distinct[rows]
-    squared = ((samples[:, None].astype(np.float64) - samples[None]) ** 2).sum(-1)
-    squared[rows[:, None] == rows[None]] = np.inf
-    distance = np.sqrt(np.sort(squared, axis=1)[:, 2])
-    found = knn_entropy(samples, 3, labels=jnp.asarray(rows, jnp.int32))
-    # Copies count among the 499 others. Where two of the three nearest are copies of one state,
-    # they count twice, as in the sum above. Tolerance as in the test before.
-    np.testing.assert_allclose(found, formula(distance, 499, 3, 2), rtol=0, atol=1e-5)
+def test_only_the_samples_that_count_enter():
+    samples = np.random.default_rng(4).standard_normal((500, 2)).astype(np.float32)
+    found = jax.jit(lambda count: knn_entropy(samples, 3, count))(jnp.int32(300))
+    # Derived: sums of float32 terms in another order, as in the test before.
+    np.testing.assert_allclose(found, knn_entropy(samples[:300], 3), rtol=0, atol=1e-5)
+    assert np.isnan(knn_entropy(samples, 3, 3))
 
 
-def test_coinciding_samples_without_labels_have_entropy_minus_infinity():
+@pytest.mark.parametrize("copies", [1, 3, 8])
+def test_states_of_large_weight_do_not_bias_the_entropy_of_a_mixture(copies):
+    # A draw of N in proportion to weights would take each of these states `copies` times.
+    num = N // copies
+    states = np.random.default_rng(6).standard_normal((N, 7)).astype(np.float32)
+    weights = jnp.where(jnp.arange(N) < num, 1.0, 0.0)
+    rows, count = mixture.draw_distinct(weights, N, jax.random.key(0))
+    assert abs(int(count) - num) <= 1  # 1 / (1 / num) is rounded
+    assert len(set(np.asarray(rows[:count]))) == count
+    found = knn_entropy(jnp.asarray(states)[rows], K, count)
+    np.testing.assert_allclose(found, knn_entropy(states[:num], K), rtol=0, atol=0.01)
+
+
+def test_coinciding_samples_have_entropy_minus_infinity():
     samples = np.repeat(np.random.default_rng(5).standard_normal((750, 1)), 2, axis=0)
     assert knn_entropy_jit(samples.astype(np.float32), 1) == -np.inf
     assert np.isfinite(knn_entropy_jit(samples.astype(np.float32), 3))

@@ -212,6 +212,16 @@ def test_rows_of_equal_weight_are_drawn_equally_often(num_drawn, times):
         assert counts.max() == np.ceil(times)
 
 
+@pytest.mark.parametrize("num_drawn", [8000, 4000, 8192])
+def test_every_episode_gets_its_share_of_rows(num_drawn):
+    weights = jnp.ones(1000 * 32)  # 1,000 steps of 32 episodes
+    rows = mixture.draw_rows(weights, num_drawn, jax.random.key(0), num_episodes=32)
+    counts = np.bincount(np.asarray(rows) % 32, minlength=32)
+    assert np.abs(counts - num_drawn / 32).max() <= 1
+    steps = np.bincount(np.asarray(rows) // 32 // 100, minlength=10)
+    assert np.abs(steps - num_drawn / 10).max() <= 32  # less than one for each episode
+
+
 def test_another_key_draws_other_rows():
     weights = jnp.ones(1000)
     draws = [np.asarray(mixture.draw_rows(weights, 50, jax.random.key(i))) for i in range(2)]

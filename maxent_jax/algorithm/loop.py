@@ -106,7 +106,9 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
     # While the history is empty, the first rollouts take its place.
     unseen = (learner.history.seen == 0) & visited.alive
     history = reservoir.add(learner.history, visited.features, unseen, key_history)
-    rows = mixture.draw_rows(visited.weight, config.mixture.reference_size, key_rows)
+    rows = mixture.draw_rows(
+        visited.weight, config.mixture.reference_size, key_rows, visited.num_episodes
+    )
     rows = jnp.where(method.from_history, -1, rows)
     reference = Reference(
         jnp.where(method.from_history, history.points, visited.features[rows]),

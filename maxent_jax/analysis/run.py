@@ -190,9 +190,9 @@ class Run:
     @in_32_bits
     def scores(self, visited: Occupancy, seed: int = 0) -> Scores:
         """Scores each policy by its return under the reward that these states define."""
-        rows = mixture.draw_rows(
-            visited.weight, self.config.mixture.reference_size, jax.random.key(seed)
-        )
+        key = jax.random.key(seed)
+        size = self.config.mixture.reference_size
+        rows = mixture.draw_rows(visited.weight, size, key, visited.num_episodes)
         return _score(self.components, visited, visited.features[rows], rows, self.mixture)
 
     def summaries(self, visited: Occupancy, seed: int = 0) -> list[Summary]:

@@ -43,15 +43,16 @@ def knn_density(
     return jnp.exp(log_density(distance, others, k, dims))
 
 
-def knn_entropy(samples: jax.Array, k: int, labels: jax.Array | None = None) -> jax.Array:
+def knn_entropy(samples: jax.Array, k: int, count: jax.Array | None = None) -> jax.Array:
     """Estimates the differential entropy of the distribution that samples come from.
 
     Args:
-      samples: [N, F]. Each is measured against the N - 1 others.
+      samples: [N, F]. Each is measured against the others. They must be distinct draws: copies of
+        a sample would be neighbours of the others that do not count as such, and bias the estimate.
       k: which neighbour.
-      labels: [N] int, equal for copies of one sample that was drawn more than once.
+      count: [] int32, how many of the samples count, from the first; all of them if None.
     Returns:
-      [] nats; -inf where k or more samples coincide with another one.
+      [] nats; -inf where k or more samples coincide with another one; NaN if count <= k.
     Raises:
       ValueError: N <= k, or as `knn_distances`.
       TypeError: as `knn_distances`.
@@ -63,8 +64,9 @@ def knn_entropy(samples: jax.Array, k: int, labels: jax.Array | None = None) -> 
     num_samples, dims = np.shape(samples)
     if num_samples <= k:
         raise ValueError(f"{num_samples} samples are too few for {k} neighbours")
-    labels = jnp.arange(num_samples, dtype=jnp.int32) if labels is None else labels
-    if np.shape(labels) != (num_samples,):
-        raise ValueError(f"labels have shape {np.shape(labels)}, but must be [{num_samples}]")
-    distance = knn_distances(samples, samples, k, exclude=labels, labels=labels)[:, -1]
-    return jnp.mean(-log_density(distance, num_samples - 1, k, dims)) + jnp.log(k) - digamma(k)
+    own = jnp.arange(num_samples, dtype=jnp.int32)
+    counted = num_samples if count is None else count
+    distance = knn_distances(samples, samples, k, exclude=own, count=count)[:, -1]
+    surprise = -log_density(distance, counted - 1, k, dims)
+    mean = jnp.sum(jnp.where(own < counted, surprise, 0.0)) / counted
+    return jnp.where(counted > k, mean + jnp.log(k) - digamma(k), jnp.nan)

@@ -6,11 +6,11 @@ s' under the skill z is (φ(s') - φ(s))·z. φ is trained to raise it, under th
 moves by at most 1 in each dimension of φ's space, in the mean of squares; a dual variable λ
 enforces it. The policy sees z in its observation (envs/skills.py).
 
-Departures: φ sees states normalised by the moments of the first 10,000 that it is shown, and the
-policy by their running moments; their code has constants measured once. The rewards of a vector
-step come before its gradient steps of φ, theirs after each. Their learner waits for 10,000
-transitions; ours begins at once. φ's hidden layers are as wide as the critics': theirs all have
-1,024 units.
+Departures: φ sees states normalised by the moments of those drawn until the replay holds 10,000
+steps, and the policy by their running moments; their code has constants measured once. The rewards
+of a vector step come before its gradient steps of φ, theirs after each. Their learner waits for
+10,000 transitions; ours begins at once. At a time limit ours bootstraps; theirs takes it for the
+end. φ's hidden layers are as wide as the critics': theirs all have 1,024 units.
 """
 
 import functools
@@ -30,7 +30,7 @@ from maxent_jax.types import Metrics
 
 INITIAL_MULTIPLIER = 30.0  # dual_lam
 SLACK = 1e-3  # dual_slack
-NUM_MEASURED = 10_000  # states that set φ's units
+NUM_MEASURED = 10_000  # steps in the replay until φ's units are set
 LARGEST_INPUT = 1e6  # standard deviations: positions grow without bounds
 
 
@@ -50,7 +50,7 @@ class Parameters(NamedTuple):
 
 
 class State(NamedTuple):
-    """φ and λ with their optimiser, and the moments of the first states."""
+    """φ and λ with their optimiser, and the moments of early states."""
 
     learned: Learned
     inputs: Moments  # [I]
@@ -84,14 +84,14 @@ def init(metra: Metra, key: jax.Array) -> State:
 
 
 def reward(metra: Metra, state: State, steps: Steps) -> tuple[State, jax.Array]:
-    """Returns the reward [B]; the first states set the units of φ's inputs.
+    """Returns the reward [B]; states of the first steps set the units of φ's inputs.
 
     Raises:
       ValueError: the steps have no skill.
     """
     if steps.next_state is None or steps.skill is None:
         raise ValueError("METRA rewards skills, but the steps have none")
-    measuring = jnp.full(steps.row.shape, state.inputs.weight < NUM_MEASURED)
+    measuring = jnp.full(steps.row.shape, jnp.max(steps.row) < NUM_MEASURED)
     state = state._replace(inputs=moments.update(state.inputs, steps.next_state, measuring))
     return state, along(displacement(metra, state, state.learned.parameters.phi, steps), steps)
 

@@ -18,7 +18,7 @@ from maxent_jax.types import Metrics
 
 
 class Occupancy(NamedTuple):
-    """The R = T·E states of E episodes, each with its share of the mixture's occupancy."""
+    """The R = T·E states of E episodes, step by step, each with its share of the mixture's occupancy."""
 
     states: jax.Array  # [R, D]
     features: jax.Array  # [R, F]
@@ -28,6 +28,11 @@ class Occupancy(NamedTuple):
     episode_policy: jax.Array  # [E] int32
     num_invalid: jax.Array  # [] int32
     task_return: jax.Array | None = None  # [E] of each episode, undiscounted; None without a task
+
+    @property
+    def num_episodes(self) -> int:
+        """E."""
+        return self.episode_policy.shape[0]
 
 
 class Scores(NamedTuple):
@@ -264,15 +269,17 @@ def measures(components: Components, occupancy: Occupancy, key: jax.Array) -> Me
     """Measures the mixture's coverage and entropies (nats), on the grid and in feature space."""
     config = components.config
     cells = histogram.count(occupancy.states, components.grid, occupancy.weight)
-    rows = mixture.draw_rows(occupancy.weight, config.mixture.reference_size, key)
-    sample = occupancy.features[rows]
+    # Copies of a state would be each other's neighbours, and the estimate biased.
+    rows, count = mixture.draw_distinct(
+        occupancy.weight, config.mixture.reference_size, key, occupancy.num_episodes
+    )
     off_grid = histogram.cells(occupancy.states, components.grid) == components.grid.num_cells
     return {
         "mixture_coverage": histogram.coverage(cells),
         "mixture_entropy": histogram.shannon_entropy(cells),
         "mixture_off_grid_share": jnp.sum(jnp.where(off_grid, occupancy.weight, 0.0)),
         "mixture_knn_entropy": entropy.knn_entropy(
-            sample, config.intrinsic.num_neighbors, labels=rows
+            occupancy.features[rows], config.intrinsic.num_neighbors, count
         ),
         "evaluation_episode_length": jnp.sum(occupancy.alive) / occupancy.episode_policy.shape[0],
         **_unit_cells(components, occupancy),

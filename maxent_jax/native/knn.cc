@@ -80,6 +80,20 @@ INLINE uint32_t below(Lanes a, Lanes b) {
 #endif
 }
 
+// One bit for each lane in which `a` is below `b` or NaN.
+INLINE uint32_t not_above(Lanes a, Lanes b) {
+#if defined(__AVX512F__)
+  return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_NGE_UQ);
+#elif defined(__AVX2__)
+  return _mm256_movemask_ps(_mm256_cmp_ps((__m256)a, (__m256)b, _CMP_NGE_UQ));
+#else
+  const Mask is_at_least = a >= b;
+  uint32_t bits = 0;
+  for (int lane = 0; lane < kLanes; ++lane) bits |= (~is_at_least[lane] & 1u) << lane;
+  return bits;
+#endif
+}
+
 INLINE Lanes all(float x) { return Lanes{} + x; }
 
 // Inserts a square into the `k` smallest, which are ascending.
@@ -132,9 +146,9 @@ INLINE int64_t pass(const Problem& problem, int64_t from, int64_t to, const floa
         squares[u] += difference * difference;
       }
     }
-    Lanes nearest = squares[0];
+    Lanes nearest = squares[0];  // stays NaN if it is: `smaller` drops a NaN on its left alone
     for (int u = 1; u < kUnroll; ++u) nearest = smaller(squares[u], nearest);
-    if (__builtin_expect(!below(nearest, worst), 1)) continue;
+    if (__builtin_expect(!not_above(nearest, worst), 1)) continue;
     for (int u = 0; u < kUnroll; ++u) {
       if (!below(squares[u], worst)) continue;
       Lanes square = excluded == problem.labels[m + u] ? all(kInf) : squares[u];
