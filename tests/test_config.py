@@ -27,7 +27,7 @@ def test_presets_are_valid_in_every_environment_and_survive_a_round_trip(name, e
         (dict(env="brax:antt"), "did you mean 'brax:ant'"),
         (dict(env="pendulum", backend="mjx"), "pendulum has only: auto"),
         (dict(env="brax:ant", physics="fast"), "brax:ant has only: reference"),
-        (dict(env="pendulum", torque_limit=0.5), "no torques to limit"),
+        (dict(env="pendulum", torque_limit=0.5), "the action of pendulum is not scaled"),
         (dict(env="walker2d", end_flipped=True), "no floating torso that can be upside down"),
         (dict(env="walker2d", policy_inputs="heading"), "no floating torso with a heading"),
         (dict(env="walker2d", yaw_copies=1), "cannot turn about the vertical"),
@@ -46,7 +46,8 @@ def test_presets_are_valid_in_every_environment_and_survive_a_round_trip(name, e
         (dict(steps_per_iteration=401), "a multiple of num-envs × num-segments = 8"),
         (dict(updates_per_step=0.3), "a whole number"),
         (dict(updates_per_step=1e-9), "a whole number"),
-        (dict(seed=2**31), "must not exceed 2"),
+        (dict(seed=2**31), "seed is 2147483648, but must be at most 2147483647"),
+        (dict(seed=2**31 - 1, num_seeds=2), "must not exceed 2"),
         (dict(mixture_episodes=2), "must be at least 3, one for each policy"),
         (dict(reference_size=801), "at most mixture-episodes × episode-length = 800"),
         (dict(num_envs=400, num_segments=1, replay_size=1599), "at least 4 × num-envs = 1600"),
@@ -58,6 +59,18 @@ def test_presets_are_valid_in_every_environment_and_survive_a_round_trip(name, e
         (dict(cell_restarts=0.5, restart_share=0.5), "so set one of them to 0"),
         (dict(method="apt", batch_size=12), "apt needs more than 12 transitions in the 1 batches"),
         (dict(method="h-official", start="best"), "start best needs mixing episode"),
+        (dict(mixing="step", leave_own_out=False), "start best, which method v has, needs mixing"),
+        (dict(eta=0.2), "weights are uniform: only geometric weights have an eta"),
+        (dict(shaping_survives_death=True), "but shaping is 0"),
+        (dict(task_scale=2.0), "task-scale is 2.0, but task is none"),
+        (dict(intrinsic_weight=0.5), "intrinsic-weight is 0.5, but task is none"),
+        (dict(intrinsic_weight=0.0, task="forward"), "no policy is scored: start best, which"),
+        (dict(source_iterations=1), "source-iterations is 1, but there is no source"),
+        (dict(intrinsic_decay=2**31), "intrinsic-decay is 2147483648, but must be at most"),
+        (
+            dict(task="forward", source="runs/x", start_from="both", stale_rewards=True),
+            "stale-rewards is on, but start-from is both",
+        ),
         (dict(plateau_segments=2), "at most half of num-segments = 2"),
         (dict(plateau_tolerance=-0.1), "0 or more"),
         (dict(snapshots=3), "must divide num-segments = 2"),
@@ -95,7 +108,7 @@ def test_an_environment_that_has_v_start_from_scratch_leaves_the_others_their_ow
 
 def test_configs_of_all_methods_share_one_program():
     base = preset("smoke")
-    for changes in (dict(method="h"), dict(seed=3), dict(refresh_period=5), dict(eta=0.01)):
+    for changes in (dict(method="h"), dict(seed=3), dict(refresh_period=5), dict(weights="geometric", eta=0.01)):
         assert preset("smoke", **changes).program() == base.program()
     assert preset("smoke", num_envs=8).program() != base.program()
 

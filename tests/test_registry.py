@@ -75,9 +75,9 @@ def test_a_module_that_fails_is_named_with_its_reason(tmp_path):
 
 
 def test_a_methods_settings_are_its_own(restored_tables):
-    registry.register_method("mine", "fully_corrective", 5, "history", "scratch", eta=0.5)
+    registry.register_method("mine", "geometric", 5, "history", "scratch", eta=0.5)
     config = preset("smoke", method="user:mine", env="pendulum")
-    assert config.mixture.eta == 0.5 and config.mixture.weights == "fully_corrective"
+    assert config.mixture.eta == 0.5 and config.mixture.weights == "method"
     assert registry.method("user:mine").refresh_period == 5
 
 

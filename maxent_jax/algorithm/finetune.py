@@ -58,7 +58,7 @@ def _from_archive(
     key, key_first = jax.random.split(state.key)
     returns, num_steps = jnp.full(size, jnp.nan), jnp.zeros((), jnp.int32)
     if start_from in names.PLAYING:
-        fills = start_from != "best"
+        fills = start_from in names.FILLING
         learner, returns, num_steps = _play(
             p, learner, archive, size, num_episodes, fills, key_first
         )
@@ -91,7 +91,7 @@ class _Episode(NamedTuple):
     """What restarts are drawn from, of E episodes."""
 
     env: base.State  # [T, E, ...]
-    goes_on: jax.Array  # [T, E] bool: the state is neither terminal nor beyond the end
+    goes_on: jax.Array  # [T, E] bool: the episode continues after the state
     task_return: jax.Array  # [E]
 
 
@@ -138,7 +138,8 @@ def _play(
             episodes=played.episodes.at[policy].add(1.0),
             num_steps=played.num_steps + jnp.sum(alive, dtype=jnp.int32),
         )
-        return played, _Episode(reached.env, reached.alive & ~reached.terminated, returns)
+        goes_on = (reached.alive & ~reached.terminated).at[-1].set(False)  # the time limit
+        return played, _Episode(reached.env, goes_on, returns)
 
     first = _Played(learner, nothing, nothing, jnp.zeros((), jnp.int32))
     key, key_restarts = jax.random.split(key)
@@ -163,14 +164,16 @@ def _restarting(p: Components, episodes: Episodes, found: _Episode, key: jax.Arr
     """Lets a share of the episodes begin at states of the best tenth of those that were found.
 
     An episode is drawn in proportion to how far its return is above the worst. If all returns are
-    equal, as when a sparse task was never solved, all episodes are alike.
+    equal, as when a sparse task was never solved, all episodes are alike. One that ends with its
+    first step has no state to begin at.
     """
     key_episode, key_time, key_begin = jax.random.split(key, 3)
     num = min(NUM_RESTARTS, p.config.environment.num_starts)
     returns = found.task_return
     least_of_best = jax.lax.top_k(returns, -(-returns.shape[0] // 10))[0][-1]
-    above = jnp.where(returns >= least_of_best, returns - jnp.min(returns), 0.0)
-    share = jnp.where(jnp.max(above) > 0, above, 1.0)
+    has_any = jnp.any(found.goes_on, axis=0).astype(jnp.float32)
+    above = has_any * jnp.where(returns >= least_of_best, returns - jnp.min(returns), 0.0)
+    share = jnp.where(jnp.max(above) > 0, above, jnp.where(jnp.max(has_any) > 0, has_any, 1.0))
     chosen = jax.random.choice(key_episode, share.shape[0], (num,), p=share / jnp.sum(share))
     logits = jnp.where(found.goes_on[:, chosen], 0.0, -jnp.inf)
     time = jax.random.categorical(key_time, logits, axis=0)

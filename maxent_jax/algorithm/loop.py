@@ -179,9 +179,8 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
         deterministic = p.config.evaluation.deterministic
         return occupancy.of_mixture(p, archive, weights, starts, key_rollout, True, deterministic)
 
-    if (
-        p.config.mixture.weights == CORRECTIVE
-    ):  # fit the weights to other episodes than those that are measured
+    if p.config.mixture.weights == CORRECTIVE:
+        # Fitted to the episodes that are measured, the weights would look better than they are.
         fitted_to = roll_out(weights, *jax.random.split(jax.random.key(EVALUATION_SEED + 1)))
         _, weights = occupancy.corrected(p, fitted_to, weights)
     visited = roll_out(weights, key_starts, key_rollout)

@@ -35,8 +35,7 @@ def pay(
     if components.bonus is None:
         bonus, paid = learner.bonus, intrinsic(components, drawn.outcomes)
     else:
-        key_bonus = jax.random.fold_in(key, 2)
-        bonus, paid, metrics = pay_bonus(components, learner, drawn, key_bonus)
+        bonus, paid, metrics = pay_bonus(components, learner, drawn, key)
     return bonus, with_task(components, learner, paid, drawn.outcomes), metrics
 
 

@@ -36,11 +36,12 @@ class _Keys(NamedTuple):
     env: jax.Array
     history: jax.Array
     yaw: jax.Array
+    draw: jax.Array
     learn: jax.Array
 
 
 def _keys(key: jax.Array) -> _Keys:
-    return _Keys(*jax.random.split(key, 6))
+    return _Keys(*jax.random.split(key, len(_Keys._fields)))
 
 
 def steps(
@@ -64,18 +65,18 @@ def steps(
 
     # Batches are drawn right after the vector step before. Drawn later, they would make XLA copy
     # the replay, which the vector step changes in place.
-    def draw(learner, key_learn):
-        return learner.replay.size > 0, _draw(components, learner, key_learn)
+    def draw(learner, key_draw):
+        return learner.replay.size > 0, _draw(components, learner, key_draw)
 
     def step_and_draw(carry, keys):
         learner, (ready, batches) = carry
-        own, next_key_learn = keys
+        own, next_key_draw = keys
         learner, metrics = _step_beside(components, method, learner, ready, batches, own)
-        return (learner, draw(learner, next_key_learn)), metrics
+        return (learner, draw(learner, next_key_draw)), metrics
 
     every = jax.vmap(_keys)(keys)
-    first = learner, draw(learner, every.learn[0])
-    (learner, _), metrics = jax.lax.scan(step_and_draw, first, (every, jnp.roll(every.learn, -1)))
+    first = learner, draw(learner, every.draw[0])
+    (learner, _), metrics = jax.lax.scan(step_and_draw, first, (every, jnp.roll(every.draw, -1)))
     return learner, metrics
 
 
@@ -89,7 +90,7 @@ def step(
         components.env, learner.episodes, _action(components, learner, keys), length, keys.env
     )
     learner, of_steps = _record(components, method, learner, episodes, everyone, keys)
-    drawn = _draw(components, learner, keys.learn)
+    drawn = _draw(components, learner, keys.draw)
     learned, of_updates = _learn(components, method, learner, drawn, keys.learn)
     return _updated(components, learner, learned), of_updates | of_steps
 
@@ -241,10 +242,9 @@ def _visit_plane(
 def _draw(components: Components, learner: Learner, key: jax.Array) -> Experience:
     """Draws the batches of one vector step, [updates, B]."""
     config = components.config
-    key_sample, _ = jax.random.split(key)
     shape = (config.updates_per_vector_step, config.learner.batch_size)
     starts = learner.episodes.starts.obs
-    return experience.sample(components, learner.replay, starts, shape, key_sample)
+    return experience.sample(components, learner.replay, starts, shape, key)
 
 
 def _learn(
@@ -252,7 +252,7 @@ def _learn(
 ) -> tuple[Learned, Metrics]:
     """The gradient steps of one vector step, on rewards of the learner's reference."""
     config = components.config
-    _, key_update = jax.random.split(key)
+    key_bonus, key_update = jax.random.split(key)
     # Stored distances stay valid while the reference does; the branch touches only drawn rows.
     distances = jax.lax.cond(
         _changes_within_iteration(method) & (not config.intrinsic.stale_rewards),
@@ -261,7 +261,7 @@ def _learn(
         drawn.outcomes,
     )
     drawn = drawn._replace(outcomes=drawn.outcomes._replace(distances=distances))
-    bonus, paid, of_bonus = payment.pay(components, learner, drawn, key)
+    bonus, paid, of_bonus = payment.pay(components, learner, drawn, key_bonus)
     total, beyond = payment.returns(drawn.outcomes, paid, config.learner.discount)
     batches = losses.Batch(drawn.observation, drawn.action, total, drawn.next_observation, beyond)
 

@@ -103,10 +103,9 @@ def flag_values(argv: Sequence[str], flag: str) -> list[str]:
     """Returns the values that follow `--flag`, before the command line is parsed."""
     values: list[str] = []
     for i, word in enumerate(argv):
-        if word == flag:
-            values += argv[i + 1 : i + 2]
-        elif word.startswith(flag + "="):
-            values.append(word.split("=", 1)[1])
+        name, equals, value = word.partition("=")
+        if name.replace("_", "-") == flag:  # tyro takes both spellings
+            values += [value] if equals else argv[i + 1 : i + 2]
     return values
 
 

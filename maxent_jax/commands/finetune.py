@@ -58,6 +58,9 @@ def _default_config(argv: Sequence[str]) -> Config:
             return Config()
         raise errors.UsageError("the run's directory is missing: name it first.")
     directory, task = Path(argv[0]), cli.flag_value(argv, "--task")
+    resumed = train.resumed_config(argv)
+    if resumed is not None:
+        return resumed
     of_source = files.read_config(directory)
     if not task:
         known = ", ".join(tasks.of_environment(of_source.env))

@@ -20,11 +20,11 @@ from maxent_jax.config import Config, preset, registry, tasks
 from maxent_jax.runs import files, integrity, runtime, source
 from maxent_jax.runs.claim import Claim
 from maxent_jax.runs.loggers import Sinks
+from maxent_jax.visual import headless
 
 if TYPE_CHECKING:
     from maxent_jax.analysis import Run
     from maxent_jax.runs.driver import Options
-from maxent_jax.visual import headless
 
 # What matters first: --help shows these, and --help-all the rest.
 SHOWN = (
@@ -116,11 +116,19 @@ def _default_config(argv: Sequence[str]) -> Config:
     decisive = ("preset", "env", "method", "protocol", "task")
     values = {name: cli.flag_value(argv, f"--{name}") for name in decisive}
     given = {name: value for name, value in values.items() if value}
-    out = cli.flag_value(argv, "--out")
-    if "--resume" in argv and out and not given and Path(out, files.CONFIG).exists():
-        return files.read_config(Path(out))
+    resumed = None if given else resumed_config(argv)
+    if resumed is not None:
+        return resumed
     name = given.pop("preset", Config.preset)
     return preset(name, **given)
+
+
+def resumed_config(argv: Sequence[str]) -> Config | None:
+    """Returns the config of the run in --out if --resume continues it; None without one."""
+    out = cli.flag_value(argv, "--out")
+    if "--resume" in argv and out and Path(out, files.CONFIG).exists():
+        return files.read_config(Path(out))
+    return None
 
 
 def _check_saving(arguments: Arguments) -> None:
@@ -225,7 +233,7 @@ def run(arguments: Arguments, started: float) -> None:
 def train(config: Config, out: str | Path, resume: bool = False, overwrite: bool = False) -> "Run":
     """Trains a run in this process, draws its figures and loads it, as the command `train` does.
 
-    Progress goes to standard error.
+    Progress goes to standard error, and a summary to standard output.
 
     Args:
       config: the settings, for example `preset("quick", env="pendulum")`.
@@ -236,7 +244,9 @@ def train(config: Config, out: str | Path, resume: bool = False, overwrite: bool
       The finished run; of several seeds, the first (see `load_run`).
     Raises:
       UsageError, RunError: the directory is not free, or holds a run with other settings.
-      ConfigError: the settings do not fit this machine.
+      ConfigError: the settings do not fit this machine, or the run to start from.
+      CheckpointCorruptError: the last checkpoint is damaged.
+      SaveError: a file cannot be written.
       NonFiniteError: training produced a number that is not finite.
       Interrupted: a signal arrived, and the run is saved.
     """

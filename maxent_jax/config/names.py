@@ -3,6 +3,7 @@
 from maxent_jax.config import registry
 
 REWARDS = ("log1p", "linear", "log", "paper")
+ETA = 0.1  # of geometric weights
 INPUTS = ("state", "heading")
 SPACES = ("features", "position")
 REPLAY_DTYPES = ("float32", "float16")
@@ -12,5 +13,6 @@ REFERENCES = ("method", *registry.REFERENCES)
 STARTS = ("method", *registry.STARTS)
 # What a run can start from, of another run. In the first group, its policies play first episodes.
 PLAYING = ("best", "mixture", "both")
+FILLING = ("mixture", "both")  # with these the episodes fill the replay
 WITH_ITS_AGENT = ("last", "best", "both")
 STARTED_FROM = ("scratch", "last", *PLAYING)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 from maxent_jax.checks import check_choice
-from maxent_jax.config import paper, presets, registry, tasks, validation
+from maxent_jax.config import names, paper, presets, registry, tasks, validation
 from maxent_jax.config.registry import BY_METHOD, CORRECTIVE
 from maxent_jax.errors import ConfigError, ConfigTypeError
 
@@ -77,7 +77,7 @@ class Intrinsic(_Checked):
     reward_distance: float = 5.0
     """c: scale of the distance R, in feature units (metres for the first two features)."""
     reward_scale: float = 1.0
-    """Factor on the whole reward that SAC receives, except --alive-bonus."""
+    """Factor on the intrinsic reward, but not on --alive-bonus."""
     num_neighbors: int = 3
     """k: R is the distance to the k-th nearest reference state."""
     shaping: float = 0.0
@@ -107,7 +107,7 @@ class Mixture(_Checked):
     """Weights of the policies: method (its own choice), uniform, geometric,
     last (newest policy only), or fully_corrective (largest entropy of the
     mixture on the coverage grid)."""
-    eta: float = 0.1
+    eta: float = names.ETA
     """η of the geometric weights."""
     mixing: str = "episode"
     """How often the mixture draws a policy: for each episode, or for each step."""
@@ -300,6 +300,8 @@ class Config(_Checked):
     def replace(self, **changes: Any) -> "Config":
         """Returns this config with some settings changed, by name, whatever their group.
 
+        A preset, a protocol, a method or a task brings other settings along only in `preset(...)`.
+
         Raises:
           ConfigTypeError: a setting does not exist, or a value has the wrong type.
           ConfigError: a value is invalid.
@@ -317,7 +319,7 @@ class Config(_Checked):
         Configs with equal programs share one compilation; the data enters the state in
         `algorithm.init`.
         """
-        defaults = {name: DEFAULTS[name] for name in DATA_FIELDS}
+        defaults = {name: DEFAULTS[name] for name in DATA_FIELDS} | {"start": "last"}
         if self.mixture.weights == CORRECTIVE:  # a computation, not a table
             del defaults["weights"]
         return self.replace(**defaults)

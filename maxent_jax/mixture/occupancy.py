@@ -18,7 +18,7 @@ from maxent_jax.types import Metrics
 
 
 class Occupancy(NamedTuple):
-    """The R = T·E states of E episodes, step by step, each with its share of the mixture's occupancy."""
+    """The R = T·E states of E episodes, step by step, with their shares of the occupancy."""
 
     states: jax.Array  # [R, D]
     features: jax.Array  # [R, F]

@@ -59,7 +59,7 @@ def _rows_by_episode(weights: jax.Array, ticks: jax.Array, num_episodes: int) ->
 
 
 def _rows_at(weights: jax.Array, ticks: jax.Array) -> jax.Array:
-    """The rows [n] int32 that hold the ticks [n], shares of all weight before; the last from 1 on."""
+    """The rows [n] int32 at the ticks [n], shares of all weight; from 1 on the last row."""
     # A parallel sum rounds each prefix separately. Without the running maximum it could fall, or
     # rise at a row of weight 0.
     cumulative = jax.lax.cummax(jnp.where(weights > 0, jnp.cumsum(weights), 0.0))

@@ -23,7 +23,7 @@ from maxent_jax.runs.stages import Stage, advance, check_finite
 
 
 class Options(NamedTuple):
-    """How a run is executed; no option changes a result."""
+    """How a run is executed. Only `num_devices` changes results, by the order of sums."""
 
     num_devices: int = 1  # devices that share the run; 0: all
     fallback: bool = False  # if the latest checkpoint is damaged, use the one before
@@ -56,7 +56,7 @@ def train(
     Returns:
       The signal that arrived in the last iteration, too late to stop the run; None without one.
     Raises:
-      UsageError, ConfigError: see `check`.
+      UsageError, ConfigError: see `check`; or the run cannot start from its source.
       CheckpointCorruptError: the last checkpoint is damaged.
       SaveError: a file cannot be written.
       NonFiniteError: training produced a number that is not finite.
@@ -72,6 +72,8 @@ def train(
         if hosts.is_first():
             print(f"{directory} is complete: nothing to train.")
         return None
+    if progress is None:  # a run that continues no longer needs its source
+        source.check(config)
     if hosts.is_first():
         announce(config, directory, 0 if progress is None else len(progress.rows))
     if progress is None:

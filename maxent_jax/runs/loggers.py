@@ -84,11 +84,19 @@ def _wandb(
 ) -> Iterator[Callable[[int, Scalars], None]]:
     import wandb
 
-    with wandb.init(
-        project=project,
-        config=dataclasses.asdict(config),
-        dir=directory,
-        id=files.read_id(directory),
-        resume="allow",
-    ) as run:
+    try:
+        run = wandb.init(
+            project=project,
+            config=dataclasses.asdict(config),
+            dir=directory,
+            id=files.read_id(directory),
+            resume="allow",
+        )
+    except wandb.Error as error:
+        said = str(error).splitlines()[0].rstrip(".")
+        raise UsageError(
+            f"wandb is {project}, but Weights & Biases cannot start ({said}): log in with `wandb "
+            f"login`, set WANDB_MODE=offline, or leave out --wandb."
+        ) from None
+    with run:
         yield lambda iteration, values: run.log(values, step=iteration)

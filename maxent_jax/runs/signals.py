@@ -42,11 +42,24 @@ class Interrupted(Exception):
 
 
 class Interruption:
-    """While entered, remembers the first signal in `received`."""
+    """While entered, remembers the first signal in `received`; in the main thread alone.
+
+    Python delivers no signal to other threads, and lets no other thread set a handler.
+    """
 
     received: int | None = None
 
     def __enter__(self) -> "Interruption":
+        self._listens = threading.current_thread() is threading.main_thread()
+        if self._listens:
+            self._listen()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._listens:
+            self._end()
+
+    def _listen(self) -> None:
         self._reading, self._writing = socket.socketpair()
         self._writing.setblocking(False)
         self._wakeup = signal.set_wakeup_fd(self._writing.fileno())
@@ -54,11 +67,10 @@ class Interruption:
         self._handlers = {n: signal.signal(n, lambda *_: None) for n in heeded()}
         self._thread = threading.Thread(target=self._watch, daemon=True)
         self._thread.start()
-        return self
 
-    def __exit__(self, *_: object) -> None:
+    def _end(self) -> None:
         for number, handler in self._handlers.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
         signal.set_wakeup_fd(self._wakeup)
         self._writing.close()  # which ends the thread
         self._thread.join()

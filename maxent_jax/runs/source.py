@@ -35,8 +35,8 @@ CRITIC_STEPS, RESTART_SHARE = 9_600, 0.5
 _OF_A_MIXTURE = {
     name: DEFAULTS[name]
     for name in (
-        *("bonus", "mixing", "weights", "reference", "start", "refresh_period", "pooled"),
-        "plateau_segments",
+        *("bonus", "mixing", "weights", "eta", "reference", "start", "refresh_period", "pooled"),
+        *("plateau_segments", "stale_rewards"),
     )
 }
 
