@@ -108,7 +108,8 @@ def test_an_environment_that_has_v_start_from_scratch_leaves_the_others_their_ow
 
 def test_configs_of_all_methods_share_one_program():
     base = preset("smoke")
-    for changes in (dict(method="h"), dict(seed=3), dict(refresh_period=5), dict(weights="geometric", eta=0.01)):
+    of_data = dict(weights="geometric", eta=0.01)
+    for changes in (dict(method="h"), dict(seed=3), dict(refresh_period=5), of_data):
         assert preset("smoke", **changes).program() == base.program()
     assert preset("smoke", num_envs=8).program() != base.program()
 

@@ -16,9 +16,11 @@ import maxent_jax
 from maxent_jax import algorithm, components, mixture
 from maxent_jax.algorithm import experience, finetune, payment
 from maxent_jax.algorithm.learner import NUM_RESTARTS
+from maxent_jax.commands import finetune as finetune_command
 from maxent_jax.commands import train
 from maxent_jax.config import preset
 from maxent_jax.config.registry import ENVS
+from maxent_jax.errors import ConfigError
 from maxent_jax.runs import driver, files, source
 from maxent_jax.runs.signals import Interrupted
 from maxent_jax.sac import agent
@@ -134,6 +136,8 @@ def test_restarts_are_states_of_successful_episodes():
     # The successful policy moves right by 0.02 a step, from about 0.
     np.testing.assert_allclose(within[:, 0], 0.02 * episodes.restarts.age, atol=0.5)
     assert within[:, 0].max() > 1
+    age = np.asarray(episodes.restarts.age)
+    assert age.min() >= 1 and age.max() < config.environment.episode_length
     again = np.asarray(episodes.start) >= config.environment.num_starts
     assert ((np.asarray(episodes.age) > 0) == again).all()
     np.testing.assert_array_equal(learner.place, -1 - episodes.start)
@@ -207,7 +211,7 @@ def test_copies_are_paid_at_the_states_to_which_they_are_turned():
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        (dict(intrinsic_weight=0.0), 6.0),
+        (dict(intrinsic_weight=0.0, start="last"), 6.0),
         (dict(), 6.0 + 5.0),
         (dict(intrinsic_weight=0.5), 6.0 + 2.5),
         (dict(intrinsic_decay=400), 6.0 + 0.75 * 5.0),
@@ -350,6 +354,23 @@ def test_bad_input_gives_one_sentence(smoke_run, tmp_path, flags, sentence):
     assert not (tmp_path / "out").exists()
 
 
+def test_python_checks_the_source_before_it_writes(smoke_run, tmp_path):
+    other = on_forward(smoke_run).replace(hidden_size=64)
+    with pytest.raises(ConfigError, match="hidden-size is 64, but must be 32"):
+        maxent_jax.train(other, tmp_path / "out")
+    assert not (tmp_path / "out" / files.CONFIG).exists()
+
+
+def test_both_spellings_of_a_flag_choose_the_same_defaults(smoke_run, tmp_path):
+    of_out = ["--task", "stand", "--out", str(tmp_path)]
+    spelled = ("--from", "--start-from", "--start_from")
+    read = [
+        finetune_command.read_arguments([str(smoke_run), flag, "last", *of_out]).config
+        for flag in spelled
+    ]
+    assert read[0] == read[1] == read[2] and read[0].downstream.restart_share == 0
+
+
 def test_a_directory_without_a_run_gives_one_sentence(tmp_path):
     done = commands.call("finetune", tmp_path, "--task", "stand", expect=2)
     assert "is not the directory of a run" in done.stderr
@@ -377,5 +398,7 @@ def test_a_resumed_run_does_not_need_its_source(smoke_run, on_task, tmp_path):
     path.write_text(json.dumps(content))
     resumed = train.read_arguments(["--resume", "--out", str(copy)])
     assert resumed.config.downstream.source == "gone"
+    from_it = ["gone", "--resume", "--out", str(copy)]
+    assert finetune_command.read_arguments(from_it).config == resumed.config
     gone = commands.call("finetune", "gone", "--task", "stand", expect=2).stderr
     assert "gone is not the directory of a run" in gone

@@ -74,3 +74,10 @@ def test_a_user_signal_is_remembered_if_the_program_has_a_handler_for_it():
     process.send_signal(signal.SIGUSR2)
     process.communicate()
     assert process.returncode == -signal.SIGUSR2
+
+
+def test_another_thread_runs_without_listening():
+    code = f"import threading\nthreading.Thread(target=exec, args=({BUSY!r}, {{}})).start()"
+    process = busy(code=code)
+    out, errors = process.communicate()
+    assert process.returncode == 0 and out == "None\n" and not errors

@@ -17,7 +17,7 @@ def problems(settings: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
       settings: every setting by name, each valid by itself.
       row: of the environment.
     """
-    groups = (_budget, _mixture, _bonus, _robot, _learner, _downstream)
+    groups = (_budget, _downstream, _mixture, _bonus, _robot, _learner)
     return itertools.chain.from_iterable(group(settings, row) for group in groups)
 
 

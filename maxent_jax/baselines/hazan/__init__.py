@@ -24,6 +24,9 @@ state is used for one reset only. All other resets are gym's; the car starts at 
 [-0.6, -0.4]. To reset to any state, use
 `_replace(reset_low=(-1.2, -0.07), reset_high=(0.6, 0.07))`.
 
+One thing does not follow the code: the pendulum's speed has eight cells over ±8 rad/s. The code
+makes such cells, but sorts speeds into those of the angle, [0, π]: all speeds below π/8 share one.
+
 Left out are the online variant, and a run that plays at random but is printed as a policy's. The
 physics of `envs` differ from gym's of 2018: its pendulum turned by its speed before the limit of
 8 rad/s applied, and its car reached the goal at any velocity.
