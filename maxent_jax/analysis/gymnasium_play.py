@@ -100,13 +100,14 @@ def make(config: Config) -> RunTask:
     return RunTask(env, config)
 
 
-def play(run: Run, policies: ArrayLike, seed: int = 0) -> Paths:
+def play(run: Run, policies: ArrayLike, seed: int = 0, deterministic: bool | None = None) -> Paths:
     """Plays episodes in Gymnasium, one after another.
 
     Args:
       policies: [E] ascending, the policy that plays each episode: `[2] * 5`, or for the mixture
         `mixture.assign_episodes(run.weights, 50, 0.5)`.
       seed: of Gymnasium's starts and of the actions.
+      deterministic: the policies act by their means; None: as the config evaluates.
     Returns:
       The paths of the E episodes.
     Raises:
@@ -115,7 +116,8 @@ def play(run: Run, policies: ArrayLike, seed: int = 0) -> Paths:
     """
     policies = np.asarray(policies)
     env = make(run.config)
-    acts = {i: jax.jit(run.policy(i)) for i in np.unique(policies).tolist()}
+    mean = run.config.evaluation.deterministic if deterministic is None else deterministic
+    acts = {i: jax.jit(run.policy(i, mean)) for i in np.unique(policies).tolist()}
     length = run.config.environment.episode_length
     states = np.zeros((len(policies), length, run.components.sac.observation_size), np.float32)
     alive = np.zeros((len(policies), length), bool)
@@ -129,16 +131,20 @@ def play(run: Run, policies: ArrayLike, seed: int = 0) -> Paths:
     return Paths(states, alive, policies)
 
 
-def rollout(run: Run, episodes_per_policy: int = 5, seed: int = 0) -> Paths:
+def rollout(
+    run: Run, episodes_per_policy: int = 5, seed: int = 0, deterministic: bool | None = None
+) -> Paths:
     """Plays fresh episodes of each policy in Gymnasium; the counterpart of `Run.rollout`."""
-    return play(run, np.repeat(np.arange(run.num_policies), episodes_per_policy), seed)
+    policies = np.repeat(np.arange(run.num_policies), episodes_per_policy)
+    return play(run, policies, seed, deterministic)
 
 
 def gap(run: Run, episodes_per_policy: int = 5, seed: int = 0) -> dict[str, Gap]:
     """Compares each measure of the same policies in Gymnasium and in our simulator.
 
     Gymnasium plays one set of episodes, and our simulator NUM_SETS sets of the same size. Two sets
-    in our simulator also differ by about `chance`, so a smaller difference means nothing.
+    in our simulator also differ by about `chance`, so a smaller difference means nothing. One
+    policy plays each episode, also in runs with `mixing` step, whose mixture is another.
     """
     seeds = range(seed, seed + NUM_SETS)
     theirs = measures(run, rollout(run, episodes_per_policy, seed), seed)

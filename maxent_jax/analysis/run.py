@@ -14,7 +14,7 @@ from jax.export import Exported
 
 from maxent_jax import components, errors, mixture
 from maxent_jax.algorithm import methods
-from maxent_jax.analysis import dataset, export
+from maxent_jax.analysis import dataset, export, weighing
 from maxent_jax.checks import check_path, check_whole
 from maxent_jax.components import Components
 from maxent_jax.config import Config, tasks
@@ -36,7 +36,7 @@ class Paths(NamedTuple):
 
     states: np.ndarray  # [E, T, D]
     alive: np.ndarray  # [E, T] bool: reached before the episode's end
-    policy: np.ndarray  # [E] int, ascending
+    policy: np.ndarray  # [E] int, ascending; -1 if policies were drawn at each step
 
 
 class Summary(NamedTuple):
@@ -100,15 +100,20 @@ class Run:
         """Returns phi(s), [..., D] -> [..., F]; `components.phi.names` names the features."""
         return self.components.phi(jnp.asarray(states))
 
-    def policy(self, index: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    def policy(
+        self, index: int, deterministic: bool = False
+    ) -> Callable[[jax.Array, jax.Array], jax.Array]:
         """Returns a policy as a function: state [..., D], key -> action [..., A] in [-1, 1].
 
         The function raises ValueError if a state is not [..., D].
 
+        Args:
+          index: of the policy; 0 is the untrained one.
+          deterministic: act by the tanh of the Gaussian's mean; the key then changes nothing.
         Raises:
           IndexError: there is no policy `index`.
         """
-        return functools.partial(_act, self.components, self._policy(index))
+        return functools.partial(_act, self.components, self._policy(index), deterministic)
 
     @in_32_bits
     def act(self, s: jax.Array, key: jax.Array, policy: int | None = None) -> jax.Array:
@@ -130,9 +135,27 @@ class Run:
         return export.policy(self.components.sac, self._policy(index), deterministic)
 
     @in_32_bits
-    def occupancy(self, episodes_per_policy: int = 5, seed: int = 0) -> Occupancy:
-        """Plays fresh episodes of each policy, and weighs the states as the mixture does.
+    def occupancy(
+        self,
+        episodes_per_policy: int = 5,
+        seed: int = 0,
+        deterministic: bool | None = None,
+        by_policy: bool = False,
+    ) -> Occupancy:
+        """Plays fresh episodes of the mixture, and weighs their states, as training evaluates it.
 
+        Each policy plays equally often, and its states share its weight. With `pooled`, policies
+        are drawn by weight instead. With `mixing` step, they are drawn at each step: no episode
+        belongs to one policy, and `policy` and `episode_policy` are -1.
+
+        Args:
+          episodes_per_policy: times `num_policies` is the number of episodes in all.
+          seed: of starts and actions.
+          deterministic: the policies act by their means; None: as the config evaluates.
+          by_policy: each policy plays equally often in any case. This changes nothing unless the
+            config has `pooled` or `mixing` step. With `pooled`, every episode then counts by the
+            weight of its policy; with `mixing` step, the states of a policy share its weight, and
+            the occupancy is not that of the mixture.
         Raises:
           ValueError: episodes_per_policy < 1, or the episodes do not fit into memory.
         """
@@ -140,33 +163,60 @@ class Run:
         memory.check_episodes(self.config, episodes_per_policy * self.num_policies)
         key_starts, key_play = jax.random.split(jax.random.key(seed))
         num_episodes = episodes_per_policy * self.num_policies
-        by_policy = self._components_by_policy
-        starts = jax.vmap(by_policy.env.reset)(jax.random.split(key_starts, num_episodes))
+        mean = self.config.evaluation.deterministic if deterministic is None else deterministic
+        playing = self._components_by_policy if by_policy else self.components
+        starts = jax.vmap(playing.env.reset)(jax.random.split(key_starts, num_episodes))
         weights = jnp.asarray(self.weights)
-        return _of_mixture(by_policy, self.mixture, weights, starts, key_play)
+        found = _of_mixture(playing, self.mixture, weights, starts, key_play, False, bool(mean))
+        if by_policy:
+            return self._weighed(found)
+        if self.config.mixture.mixing == "step":
+            nobody, nobodys = -jnp.ones_like(found.episode_policy), -jnp.ones_like(found.policy)
+            return found._replace(episode_policy=nobody, policy=nobodys)
+        return found
+
+    def occupancies(
+        self, episodes_per_policy: int = 5, seed: int = 0
+    ) -> tuple[Occupancy, Occupancy]:
+        """Returns the occupancy to measure, and the one by policy, for scores and paths.
+
+        They are the same object unless the config has `pooled` or `mixing` step.
+        """
+        visited = self.occupancy(episodes_per_policy, seed)
+        if not self.config.mixture.pooled and self.config.mixture.mixing == "episode":
+            return visited, visited
+        return visited, self.occupancy(episodes_per_policy, seed, by_policy=True)
 
     @in_32_bits
     def occupancy_of(self, episodes: Paths) -> Occupancy:
         """Makes the occupancy of given episodes, at least one of each policy.
 
+        It is weighted as `occupancy(by_policy=True)` is.
+
         Raises:
           ValueError: a policy has no episode, or an episode's policy is not in the mixture.
         """
-        played = set(np.unique(episodes.policy).tolist())
-        if played != set(range(self.num_policies)):
-            raise ValueError(
-                f"episodes are of policies {sorted(played)}, but must be of all policies from 0 to "
-                f"{self.num_policies - 1}"
-            )
+        self._check_all_played(episodes.policy)
         states = jnp.asarray(episodes.states).swapaxes(0, 1)
         alive = jnp.asarray(episodes.alive).T
         policy, none = jnp.asarray(episodes.policy, jnp.int32), jnp.zeros((), jnp.int32)
         weights = jnp.asarray(self.weights)
-        return _of_episodes(self._components_by_policy, weights, policy, states, alive, none)
+        by_policy = self._components_by_policy
+        return self._weighed(_of_episodes(by_policy, weights, policy, states, alive, none))
 
-    def rollout(self, episodes_per_policy: int = 5, seed: int = 0) -> Paths:
-        """Plays fresh episodes of each policy and returns their paths."""
-        return paths(self.occupancy(episodes_per_policy, seed))
+    def rollout(
+        self, episodes_per_policy: int = 5, seed: int = 0, deterministic: bool | None = None
+    ) -> Paths:
+        """Plays fresh episodes of each policy and returns their paths.
+
+        Args:
+          episodes_per_policy: how many; one policy plays each, also with `mixing` step.
+          seed: of starts and actions.
+          deterministic: the policies act by their means; None: as the config evaluates.
+        Raises:
+          ValueError: episodes_per_policy < 1, or the episodes do not fit into memory.
+        """
+        return paths(self.occupancy(episodes_per_policy, seed, deterministic, by_policy=True))
 
     @in_32_bits
     def dataset(self, n: int, seed: int = 0, task: str = tasks.NONE) -> dict[str, np.ndarray]:
@@ -189,14 +239,19 @@ class Run:
 
     @in_32_bits
     def scores(self, visited: Occupancy, seed: int = 0) -> Scores:
-        """Scores each policy by its return under the reward that these states define."""
+        """Scores each policy by its return under the reward that these states define.
+
+        Raises:
+          ValueError: a policy has no episode; `occupancy(by_policy=True)` has some of each.
+        """
+        self._check_all_played(visited.episode_policy)
         rows = mixture.draw_rows(
             visited.weight, self.config.mixture.reference_size, jax.random.key(seed)
         )
         return _score(self.components, visited, visited.features[rows], rows, self.mixture)
 
     def summaries(self, visited: Occupancy, seed: int = 0) -> list[Summary]:
-        """Summarises the episodes in `visited`, policy by policy."""
+        """Summarises the episodes in `visited`, policy by policy; raises as `scores` does."""
         episodes, scores, weights = paths(visited), self.scores(visited, seed), self.weights
         ends = mean_ends(self, episodes)
         return [
@@ -213,7 +268,11 @@ class Run:
 
     @in_32_bits
     def measures(self, visited: Occupancy, seed: int = 0) -> dict[str, float]:
-        """Measures the mixture's coverage and entropies (nats), named as in the metrics."""
+        """Measures the mixture's coverage and entropies (nats), named as in the metrics.
+
+        Episodes of policies of weight 0 do not count, as in training, which does not play them.
+        """
+        visited = weighing.without_weightless(visited, self.weights)
         measured = occupancy.measures(self.components, visited, jax.random.key(seed))
         return {name: value.item() for name, value in measured.items()}
 
@@ -228,6 +287,20 @@ class Run:
         """The components with which policies play equally often, whatever the config says."""
         return components.make(self.config.replace(pooled=False, mixing="episode"))
 
+    def _weighed(self, visited: Occupancy) -> Occupancy:
+        """Episodes of which each belongs to one policy, weighted as the config says."""
+        pools = self.config.mixture.pooled
+        return weighing.pooled(visited, self.weights) if pools else visited
+
+    def _check_all_played(self, episode_policy: jax.Array | np.ndarray) -> None:
+        """Raises ValueError unless the episodes are of all policies of the mixture."""
+        played = set(np.unique(episode_policy).tolist())
+        if played != set(range(self.num_policies)):
+            raise ValueError(
+                f"episodes are of policies {sorted(played)}, but must be of all policies from 0 to "
+                f"{self.num_policies - 1}: play them by rollout, or by occupancy(by_policy=True)"
+            )
+
     def _policy(self, index: int) -> Policy:
         check_whole("policy", index)
         if not -self.num_policies <= index < self.num_policies:
@@ -239,14 +312,20 @@ class Run:
 
 
 @in_32_bits
-def _act(components: Components, policy: Policy, states: jax.Array, key: jax.Array) -> jax.Array:
+def _act(
+    components: Components,
+    policy: Policy,
+    deterministic: bool,
+    states: jax.Array,
+    key: jax.Array,
+) -> jax.Array:
     size = components.sac.observation_size
     if jnp.shape(states)[-1:] != (size,):
         raise ValueError(f"states have shape {jnp.shape(states)}, but must be [..., {size}]")
-    return agent.act(components.sac, policy, jnp.asarray(states, jnp.float32), key)
+    return agent.act(components.sac, policy, jnp.asarray(states, jnp.float32), key, deterministic)
 
 
-_of_mixture = jax.jit(occupancy.of_mixture, static_argnums=0)
+_of_mixture = jax.jit(occupancy.of_mixture, static_argnums=(0, 5, 6))
 _of_episodes = jax.jit(occupancy.of_episodes, static_argnums=0)
 _score = jax.jit(occupancy.score, static_argnums=0)
 

@@ -74,8 +74,8 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
     from maxent_jax.visual import plotting
 
     run = analysis.load_run(arguments.directory, arguments.seed_index, arguments.fallback)
-    visited = run.occupancy(arguments.episodes, arguments.seed)
-    plotting.save_all(run, visited)
+    visited, by_policy = run.occupancies(arguments.episodes, arguments.seed)
+    plotting.save_all(run, visited, by_policy)
     return {
         "run": str(run.path),
         "trained_with_seed": run.seed,
@@ -84,7 +84,7 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
         "reward": run.config.intrinsic.reward,
         "coordinates": run.components.grid.names,
         "deviations_from_the_paper": run.config.deviations(),
-        "policies": [s._asdict() for s in run.summaries(visited, arguments.seed)],
+        "policies": [s._asdict() for s in run.summaries(by_policy, arguments.seed)],
         "training_coverage": int((run.histogram > 0).sum()),
         "training_entropy": float(histogram.shannon_entropy(jnp.asarray(run.histogram))),
         **(

@@ -143,15 +143,15 @@ def _seed_section(run: "Run", seed_index: int, arguments: Arguments) -> dict[str
     from maxent_jax import analysis
     from maxent_jax.visual import plotting, tables
 
-    visited = run.occupancy(arguments.episodes, arguments.seed)
+    visited, by_policy = run.occupancies(arguments.episodes, arguments.seed)
     return {
         "seed": run.seed,
         "curves": _svg(plotting.curves(run)) if run.metrics else None,
         "occupancy": _svg(plotting.occupancy_map(run, run.mixture_cells(visited))),
-        "fireworks": _svg(plotting.fireworks(run, analysis.paths(visited))),
+        "fireworks": _svg(plotting.fireworks(run, analysis.paths(by_policy))),
         "strip": _strip(run, seed_index),
         "iterations": tables.iterations(run),
-        "policies": tables.policies(run, visited, arguments.seed),
+        "policies": tables.policies(run, by_policy, arguments.seed),
         "measures": tables.measures(run.measures(visited, arguments.seed)),
         "episodes": arguments.episodes,
     }

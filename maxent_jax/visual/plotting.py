@@ -218,12 +218,12 @@ def _skill_color(angle: float) -> np.ndarray:
     return np.array(matplotlib.colormaps["hsv"](angle / (2 * np.pi) % 1.0))
 
 
-def save_all(run: Run, visited: Occupancy) -> None:
-    """Saves the three figures of a run, with the states that its mixture visited."""
+def save_all(run: Run, visited: Occupancy, by_policy: Occupancy) -> None:
+    """Saves the three figures of a run; the occupancies are those of `Run.occupancies`."""
     drawn = (
         curves(run),
         occupancy_map(run, run.mixture_cells(visited)),
-        fireworks(run, analysis.paths(visited)),
+        fireworks(run, analysis.paths(by_policy)),
     )
     for name, figure in zip(NAMES, drawn, strict=True):
         save(figure, run.path / FIGURES, name)
