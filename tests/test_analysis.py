@@ -121,6 +121,18 @@ def test_an_exported_policy_sees_inputs_normalized_by_its_own_moments():
     assert np.abs(found - plain.export_policy(1, deterministic=True).call(states)).max() > 0.01
 
 
+def test_an_exported_policy_has_32_bits_in_a_program_with_64():
+    run = make_run(env="pendulum")
+    with jax.enable_x64(True):
+        exported = run.export_policy(1, deterministic=True)
+    assert {str(x.dtype) for x in (*exported.in_avals, *exported.out_avals)} == {"float32"}
+    assert "f64" not in exported.mlir_module()
+
+
+def test_a_run_equals_itself_and_no_other(run, directory):
+    assert run == run and run != maxent_jax.load_run(directory) and run in {run}
+
+
 def test_no_such_policy_is_exported(run):
     with pytest.raises(IndexError, match="policy is 3, but the mixture has 3"):
         run.export_policy(3)

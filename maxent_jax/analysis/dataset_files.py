@@ -28,7 +28,7 @@ from maxent_jax.config.registry import MUJOCO_ENVS
 from maxent_jax.envs.task import MujocoEnv
 from maxent_jax.errors import UsageError
 from maxent_jax.precision import in_32_bits
-from maxent_jax.runs import files, integrity, locks
+from maxent_jax.runs import files, locks
 
 MANIFEST = "dataset.json"
 VERSION = 1  # of the layout
@@ -83,7 +83,7 @@ def write(
         "seed": seed,
         "run": {
             "id": files.read_id(run.path),
-            "checkpoint": integrity.checkpoints(run.path)[-1],
+            "checkpoint": run.checkpoint,
             "seed": run.seed,
             "config": run.config.flat(),
         },

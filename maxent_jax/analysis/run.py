@@ -50,9 +50,12 @@ class Summary(NamedTuple):
     mean_end: list[float]  # on the grid's axes
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Run:
-    """One seed of a run; `metrics` are columns with one entry per iteration, [T] or [T, ...]."""
+    """One seed of a run; `metrics` are columns with one entry per iteration, [T] or [T, ...].
+
+    A run equals only itself, because its arrays have no single truth value.
+    """
 
     path: Path
     config: Config
@@ -61,6 +64,7 @@ class Run:
     mixture: Archive
     histogram: np.ndarray  # [bins, bins] states visited in training
     random_histogram: np.ndarray  # [bins, bins] states visited by the random baseline
+    checkpoint: str = ""  # name of the one that was loaded; empty for a run made in memory
 
     @property
     def num_policies(self) -> int:
@@ -120,12 +124,14 @@ class Run:
         """Draws actions [..., A] for states [..., D] by `policy`, or by one drawn by weight.
 
         The mixture draws a policy once per episode. To play it, draw one and use `Run.policy`.
+        Without `policy`, it is drawn on the host at each call, so the call cannot be jitted.
         """
         key_draw, key_act = jax.random.split(key)
         if policy is None:
             policy = int(jax.random.choice(key_draw, self.weights.shape[0], p=self.weights))
         return self.policy(policy)(s, key_act)
 
+    @in_32_bits
     def export_policy(self, index: int, deterministic: bool = False) -> Exported:
         """Exports a policy for use without this package; see `export.policy` for how to call it.
 
@@ -223,6 +229,8 @@ class Run:
         """Collects `n` transitions of the mixture's fresh episodes, for offline RL.
 
         `np.savez_compressed(path, **run.dataset(n))` saves them; `dataset.collect` lists the keys.
+        One policy, which draws its actions, plays each episode, also with `mixing` step and
+        `deterministic`.
 
         Args:
           n: how many.
@@ -378,6 +386,7 @@ def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> R
         mixture=results.archive,
         histogram=np.asarray(results.visits.cells),
         random_histogram=np.asarray(results.random_visits.cells),
+        checkpoint=name,
     )
 
 

@@ -1,7 +1,8 @@
 """Writes a dataset of a run's mixture: transitions for offline reinforcement learning.
 
 The dataset is written a few episodes at a time, so it may be larger than the memory. The same
-command continues a dataset that was stopped.
+command continues a dataset that was stopped. One policy plays each episode, also in runs with
+--mixing step.
 """
 
 import dataclasses

@@ -1,7 +1,8 @@
 """Films a run's archived policies, one by one and together, without a screen.
 
 Writes into videos/ of the run's directory: policy_<i>.mp4 and policy_<i>.png (a strip of stills)
-for each policy, and mixture.mp4 and mixture.png with all policies together.
+for each policy, and mixture.mp4 and mixture.png with all policies together. One policy plays each
+episode, also in runs with --mixing step.
 """
 
 import dataclasses
