@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from maxent_jax import analysis, components
 from maxent_jax.analysis import Paths, Run
+from maxent_jax.checks import NUM_SEEDS, check_seed
 from maxent_jax.config import Config
 from maxent_jax.errors import ConfigError
 
@@ -111,10 +112,10 @@ def play(run: Run, policies: ArrayLike, seed: int = 0, deterministic: bool | Non
     Returns:
       The paths of the E episodes.
     Raises:
-      ConfigError: as in `make`.
+      ConfigError: as in `make`, or the seed is out of range.
       IndexError: there is no such policy.
     """
-    policies = np.asarray(policies)
+    policies, seed = np.asarray(policies), check_seed("seed", seed)
     env = make(run.config)
     mean = run.config.evaluation.deterministic if deterministic is None else deterministic
     acts = {i: jax.jit(run.policy(i, mean)) for i in np.unique(policies).tolist()}
@@ -146,7 +147,7 @@ def gap(run: Run, episodes_per_policy: int = 5, seed: int = 0) -> dict[str, Gap]
     in our simulator also differ by about `chance`, so a smaller difference means nothing. One
     policy plays each episode, also in runs with `mixing` step, whose mixture is another.
     """
-    seeds = range(seed, seed + NUM_SETS)
+    seeds = [(check_seed("seed", seed) + i) % NUM_SEEDS for i in range(NUM_SETS)]
     theirs = measures(run, rollout(run, episodes_per_policy, seed), seed)
     ours = [measures(run, run.rollout(episodes_per_policy, s), s) for s in seeds]
     return {name: _gap([each[name] for each in ours], value) for name, value in theirs.items()}

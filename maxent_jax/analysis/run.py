@@ -15,7 +15,7 @@ from jax.export import Exported
 from maxent_jax import components, errors, mixture
 from maxent_jax.algorithm import methods
 from maxent_jax.analysis import dataset, export, weighing
-from maxent_jax.checks import check_path, check_whole
+from maxent_jax.checks import check_path, check_seed, check_whole
 from maxent_jax.components import Components
 from maxent_jax.config import Config, tasks
 from maxent_jax.config.registry import CORRECTIVE
@@ -163,11 +163,12 @@ class Run:
             weight of its policy; with `mixing` step, the states of a policy share its weight, and
             the occupancy is not that of the mixture.
         Raises:
-          ValueError: episodes_per_policy < 1, or the episodes do not fit into memory.
+          ValueError: episodes_per_policy < 1, the seed is out of range, or the episodes do not fit
+            into memory.
         """
         check_whole("episodes_per_policy", episodes_per_policy, least=1)
         memory.check_episodes(self.config, episodes_per_policy * self.num_policies)
-        key_starts, key_play = jax.random.split(jax.random.key(seed))
+        key_starts, key_play = jax.random.split(_key(seed))
         num_episodes = episodes_per_policy * self.num_policies
         mean = self.config.evaluation.deterministic if deterministic is None else deterministic
         playing = self._components_by_policy if by_policy else self.components
@@ -220,7 +221,8 @@ class Run:
           seed: of starts and actions.
           deterministic: the policies act by their means; None: as the config evaluates.
         Raises:
-          ValueError: episodes_per_policy < 1, or the episodes do not fit into memory.
+          ValueError: episodes_per_policy < 1, the seed is out of range, or the episodes do not fit
+            into memory.
         """
         return paths(self.occupancy(episodes_per_policy, seed, deterministic, by_policy=True))
 
@@ -238,12 +240,12 @@ class Run:
           task: adds the rewards of this task, by name as in `config.tasks`; none adds none.
         Raises:
           ValueError: n < 1, or the transitions do not fit into memory.
-          ConfigError (a ValueError): the environment has no such task.
+          ConfigError (a ValueError): the environment has no such task, or the seed is out of range.
         """
         dataset.check(self.config, n)
+        key = _key(seed)
         on_task = components.with_task(self.components, task)
-        weights, key = jnp.asarray(self.weights), jax.random.key(seed)
-        return dataset.collect(on_task, self.mixture, weights, n, key)
+        return dataset.collect(on_task, self.mixture, jnp.asarray(self.weights), n, key)
 
     @in_32_bits
     def scores(self, visited: Occupancy, seed: int = 0) -> Scores:
@@ -253,9 +255,8 @@ class Run:
           ValueError: a policy has no episode; `occupancy(by_policy=True)` has some of each.
         """
         self._check_all_played(visited.episode_policy)
-        rows = mixture.draw_rows(
-            visited.weight, self.config.mixture.reference_size, jax.random.key(seed)
-        )
+        size = self.config.mixture.reference_size
+        rows = mixture.draw_rows(visited.weight, size, _key(seed))
         return _score(self.components, visited, visited.features[rows], rows, self.mixture)
 
     def summaries(self, visited: Occupancy, seed: int = 0) -> list[Summary]:
@@ -281,7 +282,7 @@ class Run:
         Episodes of policies of weight 0 do not count, as in training, which does not play them.
         """
         visited = weighing.without_weightless(visited, self.weights)
-        measured = occupancy.measures(self.components, visited, jax.random.key(seed))
+        measured = occupancy.measures(self.components, visited, _key(seed))
         return {name: value.item() for name, value in measured.items()}
 
     @in_32_bits
@@ -317,6 +318,10 @@ class Run:
                 f"{self.num_policies - 1}"
             )
         return mixture.policy(self.mixture, jnp.asarray(index % self.num_policies)).policy
+
+
+def _key(seed: int) -> jax.Array:
+    return jax.random.key(check_seed("seed", seed))
 
 
 @in_32_bits

@@ -13,7 +13,7 @@ from typing import Annotated
 import tyro
 
 from maxent_jax import errors
-from maxent_jax.checks import check_choice
+from maxent_jax.checks import check_choice, check_seed
 from maxent_jax.commands import cli
 from maxent_jax.config import tasks
 from maxent_jax.runs import files, integrity, runtime
@@ -53,8 +53,9 @@ def main(argv: Sequence[str]) -> None:
     cli.import_modules(argv)
     arguments = cli.parse(Arguments, argv, "dataset")
     check_choice("format", arguments.format, FORMATS)
-    if arguments.transitions < 1 or arguments.seed < 0:
-        raise errors.UsageError("--transitions must be at least 1, and --seed must be 0 or more.")
+    if arguments.transitions < 1:
+        raise errors.UsageError("--transitions must be at least 1.")
+    check_seed("--seed", arguments.seed)
     config = files.read_config(arguments.directory)
     config.check_registered()
     if arguments.task != tasks.NONE:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from maxent_jax import errors
+from maxent_jax.checks import check_seed
 from maxent_jax.commands import cli
 from maxent_jax.runs import files, integrity, runtime
 from maxent_jax.visual import headless
@@ -48,8 +49,9 @@ def main(argv: Sequence[str]) -> None:
     """
     cli.import_modules(argv)
     arguments = cli.parse(Arguments, argv, "evaluate")
-    if arguments.episodes < 1 or arguments.seed < 0:
-        raise errors.UsageError("--episodes must be at least 1, and --seed must be 0 or more.")
+    if arguments.episodes < 1:
+        raise errors.UsageError("--episodes must be at least 1.")
+    check_seed("--seed", arguments.seed)
     config = files.read_config(arguments.directory)
     config.check_registered()
     integrity.check_any(arguments.directory)

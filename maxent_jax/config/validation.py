@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
-from maxent_jax.checks import check_choice, check_number, check_whole
+from maxent_jax.checks import NUM_SEEDS, check_choice, check_number, check_whole
 from maxent_jax.config import names, presets, registry, tasks
 from maxent_jax.config.registry import BY_METHOD, CORRECTIVE, EnvironmentRow
 from maxent_jax.errors import ConfigError, ConfigTypeError
@@ -202,7 +202,7 @@ def _check_together(c: SimpleNamespace, row: EnvironmentRow) -> None:
             f"updates-per-step × num-envs is {updates:g}, but must be a whole number above 0.",
         ),
         (
-            c.seed + c.num_seeds > 2**31,
+            c.seed + c.num_seeds > NUM_SEEDS,
             f"seed + num-seeds is {c.seed + c.num_seeds}, but must not exceed 2^31.",
         ),
         (
