@@ -11,8 +11,9 @@ import pytest
 import maxent_jax
 from maxent_jax.analysis import dataset_files
 from maxent_jax.commands import dataset
-from maxent_jax.errors import SaveError, UsageError
-from maxent_jax.runs import files
+from maxent_jax.errors import CheckpointCorruptError, SaveError, UsageError
+from maxent_jax.runs import files, source
+from maxent_jax.runs.source import on_task
 
 NUM = 5_000  # two rounds of 32 episodes of at most 100 steps
 pytestmark = pytest.mark.filterwarnings("ignore:.*is out of date:DeprecationWarning")
@@ -193,6 +194,20 @@ def test_the_manifest_names_the_checkpoint_that_was_read(copy_of_smoke_run, tmp_
     assert later.checkpoint == "2"
     with pytest.raises(UsageError, match="holds another dataset, with another run"):
         dataset_files.write(later, tmp_path / "data", "npz", 100)
+
+
+def test_a_damaged_checkpoint_is_passed_over_on_demand(copy_of_smoke_run, tmp_path):
+    directory, out = copy_of_smoke_run, tmp_path / "data"
+    (directory / "checkpoints" / "2" / "arrays" / "results" / "_METADATA").unlink()
+    flags = (directory, "--transitions", "100", "--out", out)
+    assert "--fallback of a command" in commands.call("dataset", *flags, expect=2).stderr
+    with pytest.warns(UserWarning, match="checkpoint 2"):
+        commands.call("dataset", *flags, "--fallback")
+    held = json.loads((out / dataset_files.MANIFEST).read_text())
+    assert held["run"]["checkpoint"] == "1" and held["complete"]
+    with pytest.raises(CheckpointCorruptError) as raised:
+        source.load(on_task(files.read_config(directory), str(directory), "forward"))
+    assert "train --resume --fallback on that run" in str(raised.value)
 
 
 def test_a_directory_with_other_files_is_left_alone(run, tmp_path):

@@ -375,7 +375,8 @@ def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> R
             f"seed_index is {seed_index}, but {directory} has {config.num_seeds} "
             f"{'seed' if config.num_seeds == 1 else 'seeds'}, counted from 0."
         )
-    name, passed_over = integrity.find(directory, whole=False, fallback=fallback)
+    remedy = "load_run(..., fallback=True), or --fallback of a command, uses the one before"
+    name, passed_over = integrity.find(directory, whole=False, fallback=fallback, remedy=remedy)
     for sentence in passed_over.values():
         warnings.warn(sentence, stacklevel=2)
     results = checkpoint.restore_results(directory, name, config)

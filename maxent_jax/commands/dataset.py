@@ -38,6 +38,8 @@ class Arguments:
     """Seed of the episodes."""
     seed_index: int = 0
     """Which seed of the run, from 0, if it trained several."""
+    fallback: bool = False
+    """If the last checkpoint is damaged, use the one before."""
     out: Path | None = None
     """The dataset's directory; if left out, DIRECTORY-FORMAT."""
     modules: cli.Modules = ()
@@ -70,7 +72,7 @@ def main(argv: Sequence[str]) -> None:
     from maxent_jax.analysis import dataset_files, load_run
     from maxent_jax.runs.progress import counting
 
-    run = load_run(arguments.directory, arguments.seed_index)
+    run = load_run(arguments.directory, arguments.seed_index, arguments.fallback)
     with counting(arguments.transitions, "transitions") as report:
         dataset_files.write(
             run,

@@ -134,7 +134,8 @@ def _last_progress(directory: Path, options: Options) -> Progress | None:
     """Progress of the checkpoint to continue from, if any; resets the metrics to it."""
     if not integrity.checkpoints(directory):
         return None
-    name, passed_over = integrity.find(directory, fallback=options.fallback)
+    remedy = "the command train --resume --fallback removes it, and uses the one before"
+    name, passed_over = integrity.find(directory, fallback=options.fallback, remedy=remedy)
     progress, computed_with = checkpoint.read_progress(directory, name)
 
     def go_back_to_it() -> None:
