@@ -1,7 +1,8 @@
 """Loads a run, rolls out its mixture again, and reports what it covers.
 
-Prints a table and writes evaluation.json and figures/ into the run's directory. With --gymnasium it
-also rolls out the policies in Gymnasium's own environment and reports the sim-to-sim gap.
+Prints a table and writes evaluation.json and figures/ into the run's directory, for --seed-index 1
+evaluation_seed_1.json and figures/seed_1/. With --gymnasium it also rolls out the policies in
+Gymnasium's own environment and reports the sim-to-sim gap.
 """
 
 import dataclasses
@@ -63,7 +64,7 @@ def main(argv: Sequence[str]) -> None:
 
         gymnasium_play.make(config).close()  # fails here rather than after the rollouts
     report = evaluate(arguments)
-    files.write_json(arguments.directory / "evaluation.json", report)
+    files.write_json(files.evaluation(arguments.directory, arguments.seed_index), report)
     _print(report)
 
 
