@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import commands
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -196,6 +197,18 @@ def test_a_run_that_is_evaluated_by_means_is_analysed_by_them():
     np.testing.assert_allclose(
         torques_of(plain.rollout(2, deterministic=True)) - expected, 0, **near
     )
+
+
+def test_evaluate_measures_what_training_measured(tmp_path):
+    # The pendulum always starts hanging, so by mean actions a policy has one episode.
+    flags = ("--preset", "smoke", "--env", "pendulum", "--deterministic", "--out", tmp_path)
+    commands.call("train", *flags)
+    commands.call("evaluate", tmp_path, "--episodes", 1, "--seed", 9)
+    report = json.loads((tmp_path / "evaluation.json").read_text())
+    last = files.read_metrics(tmp_path)[-1]
+    for name in ("mixture_coverage", "mixture_entropy", "evaluation_episode_length"):
+        # Weights of the states are summed over other numbers of equal episodes.
+        assert report[name] == pytest.approx(last[name], rel=1e-5)
 
 
 def test_a_policy_acts_by_its_mean_on_demand(run, visited):
