@@ -9,6 +9,8 @@ from typing import Any
 
 from maxent_jax.errors import ConfigError
 
+NUM_SEEDS = 2**31  # from 2^32 on, jax's keys repeat
+
 
 def check_whole(name: str, value: Any, least: int | None = None) -> int:
     """Returns the value as an int.
@@ -26,6 +28,21 @@ def check_whole(name: str, value: Any, least: int | None = None) -> int:
     if least is not None and whole < least:
         raise ValueError(f"{name} is {value}, but must be at least {least}")
     return whole
+
+
+def check_seed(name: str, value: Any) -> int:
+    """Returns the value as an int.
+
+    Raises:
+      TypeError: the value is not a whole number.
+      ConfigError: the value is not in [0, NUM_SEEDS).
+    """
+    seed = check_whole(name, value)
+    if not 0 <= seed < NUM_SEEDS:
+        raise ConfigError(
+            f"{name} is {value}, but must be 0 or more, and below 2^31 = {NUM_SEEDS}."
+        )
+    return seed
 
 
 def check_number(name: str, value: Any) -> float:

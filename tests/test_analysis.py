@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import commands
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -121,6 +122,18 @@ def test_an_exported_policy_sees_inputs_normalized_by_its_own_moments():
     assert np.abs(found - plain.export_policy(1, deterministic=True).call(states)).max() > 0.01
 
 
+def test_an_exported_policy_has_32_bits_in_a_program_with_64():
+    run = make_run(env="pendulum")
+    with jax.enable_x64(True):
+        exported = run.export_policy(1, deterministic=True)
+    assert {str(x.dtype) for x in (*exported.in_avals, *exported.out_avals)} == {"float32"}
+    assert "f64" not in exported.mlir_module()
+
+
+def test_a_run_equals_itself_and_no_other(run, directory):
+    assert run == run and run != maxent_jax.load_run(directory) and run in {run}
+
+
 def test_no_such_policy_is_exported(run):
     with pytest.raises(IndexError, match="policy is 3, but the mixture has 3"):
         run.export_policy(3)
@@ -152,6 +165,112 @@ def test_distances_of_ends_are_taken_from_each_start(run):
     alive = np.tile(np.arange(100) < 5, (6, 1))
     distances = analysis.mean_end_distances(run, Paths(states, alive, np.repeat(range(3), 2)))
     np.testing.assert_allclose(distances, [5, 0.5, 6])
+
+
+def torques_of(paths):
+    """Gymnasium's Pendulum-v1 solved for the action in [-1, 1] of each step, [E, T - 1]."""
+    _, sin, speed = np.moveaxis(np.float64(paths.states), -1, 0)
+    assert (np.abs(speed) < 8).all()  # where it is not clipped
+    return (np.diff(speed) / 0.05 - 15 * sin[:, :-1]) / 6
+
+
+def make_pushing(**changes):
+    """Three policies: they push by about -0.3, 0 and 0.3 of the torque, and draw widely or not."""
+    run = make_run(env="pendulum", episode_length=20, reference_size=100, **changes)
+    output = run.mixture.parameters.actor["params"]["Dense_0"]
+    push = jnp.array([[-0.3], [0.0], [0.3]])
+    output["kernel"] = jnp.zeros_like(output["kernel"])
+    output["bias"] = jnp.concatenate([jnp.arctanh(push), jnp.full_like(push, -2.0)], axis=1)
+    return run
+
+
+def test_a_run_that_is_evaluated_by_means_is_analysed_by_them():
+    run = make_pushing(deterministic=True)
+    expected = np.repeat([-0.3, 0.0, 0.3], 2)[:, None]
+    # float32 speeds below 8, divided by 0.05 s and by the torque's 6.
+    near = dict(atol=1e-5 / 0.05 / 6, rtol=0)
+    for played in (run.rollout(2), analysis.paths(run.occupancy(2))):
+        np.testing.assert_allclose(torques_of(played) - expected, 0, **near)
+    assert np.std(torques_of(run.rollout(2, deterministic=False)) - expected) > 0.01
+    plain = make_pushing()
+    assert np.std(torques_of(plain.rollout(2)) - expected) > 0.01
+    np.testing.assert_allclose(
+        torques_of(plain.rollout(2, deterministic=True)) - expected, 0, **near
+    )
+
+
+def test_evaluate_measures_what_training_measured(tmp_path):
+    # The pendulum always starts hanging, so by mean actions a policy has one episode.
+    flags = ("--preset", "smoke", "--env", "pendulum", "--deterministic", "--out", tmp_path)
+    commands.call("train", *flags)
+    commands.call("evaluate", tmp_path, "--episodes", 1, "--seed", 9)
+    report = json.loads((tmp_path / "evaluation.json").read_text())
+    last = files.read_metrics(tmp_path)[-1]
+    for name in ("mixture_coverage", "mixture_entropy", "evaluation_episode_length"):
+        # Weights of the states are summed over other numbers of equal episodes.
+        assert report[name] == pytest.approx(last[name], rel=1e-5)
+
+
+def test_a_policy_acts_by_its_mean_on_demand(run, visited):
+    states, key = np.asarray(visited.states[:8]), jax.random.key(1)
+    mean = run.policy(1, deterministic=True)(states, key)
+    exported = run.export_policy(1, deterministic=True).call(states)
+    np.testing.assert_allclose(mean, exported, atol=1e-5)  # compiled apart
+    assert np.abs(mean - run.policy(1)(states, key)).max() > 0.01
+
+
+def test_a_mixture_that_draws_a_policy_at_each_step_is_played_so():
+    run = make_pushing(mixing="step", leave_own_out=False, start="scratch", deterministic=True)
+    whole, each = run.occupancies(4)
+    pushes = torques_of(analysis.paths(whole)).round(1)
+    # 19 draws of three policies miss one of them with probability below 2e-3.
+    assert all(set(np.abs(episode)) == {0.0, 0.3} for episode in pushes)
+    assert set(whole.episode_policy.tolist()) == {-1}
+    np.testing.assert_allclose(whole.weight, 1 / len(whole.weight), rtol=1e-6)
+    alone = torques_of(analysis.paths(each)).round(1)
+    np.testing.assert_array_equal(alone, np.repeat([-0.3, 0.0, 0.3], 4)[:, None] + 0 * alone)
+    assert len(run.summaries(each)) == 3
+    with pytest.raises(ValueError, match=r"of policies \[-1\], but must be of all policies"):
+        run.summaries(whole)
+    assert run.measures(whole)["evaluation_episode_length"] == 20
+
+
+def lived(lengths, policies):
+    """Paths [E, 20] of the pendulum at rest, each over after a length."""
+    states = np.tile(np.array([-1.0, 0.0, 0.0], np.float32), (len(lengths), 20, 1))
+    return Paths(states, np.arange(20) < np.array(lengths)[:, None], np.array(policies))
+
+
+@pytest.mark.parametrize("pooled", [False, True])
+def test_states_weigh_by_policy_or_by_number(pooled):
+    run = make_pushing(pooled=pooled)
+    found = run.occupancy_of(lived([5, 5, 10, 20], [0, 0, 1, 2])).weight.reshape(20, 4)
+    # Of 1/3 each: shared by 10, 10 and 20 states; or to each episode's states alike, where policy 0
+    # played twice: 5, 10 and 20 states of an episode.
+    by_policy = np.array([1 / 30, 1 / 30, 1 / 30, 1 / 60])
+    expected = np.array([1 / 70, 1 / 70, 1 / 35, 1 / 35]) if pooled else by_policy
+    np.testing.assert_allclose(found[0], expected, rtol=1e-5)
+
+
+def test_a_pooled_mixture_is_played_by_weight():
+    run = make_pushing(pooled=True, weights="geometric", eta=0.5)
+    weights = np.array([4, 7, 13]) / 24  # 1/8, 1/4, 1/2 projected on the simplex
+    visited, each = run.occupancies(20)
+    drawn = np.bincount(visited.episode_policy, minlength=3)
+    np.testing.assert_allclose(drawn, 60 * weights, atol=1)
+    assert np.bincount(each.episode_policy).tolist() == [20, 20, 20]
+    # Episodes of equal length: both estimate the same shares.
+    of_policy = np.bincount(each.policy, np.asarray(each.weight))
+    np.testing.assert_allclose(of_policy, weights, atol=1e-5)
+
+
+def test_episodes_of_weightless_policies_do_not_count():
+    run = make_pushing(weights="last")
+    visited = run.occupancy_of(lived([5, 10, 18, 20], [0, 1, 2, 2]))
+    visited = visited._replace(task_return=jnp.array([1.0, 2.0, 3.0, 5.0]))
+    measured = run.measures(visited)
+    assert measured["evaluation_episode_length"] == 19
+    assert measured["mixture_coverage"] == 1
 
 
 @pytest.mark.slow

@@ -73,7 +73,8 @@ def test_a_run_stopped_anywhere_ends_as_one_that_was_not(tmp_path, monkeypatch, 
         assert stopped.value.exit_code == 143
         seen += integrity.checkpoints(broken)[-1:]
     monkeypatch.setattr(driver, "Interruption", lambda: StopAt(3))  # at the end
-    assert driver.train(config, broken, time.perf_counter()) == 15
+    assert driver.train(config, broken, time.perf_counter()) == (True, 15)
+    assert driver.train(config, broken, time.perf_counter()) == (False, None)
     assert seen == ["0+0", "0+1", "1", "1+0"]
     assert timeless(broken) == timeless(whole)
     pairs = zip(jax.tree.leaves(restored(broken)), jax.tree.leaves(restored(whole)), strict=True)

@@ -10,6 +10,7 @@ import time
 import warnings
 from pathlib import Path
 
+import commands
 import jax
 import pytest
 
@@ -52,6 +53,15 @@ def test_help_is_printed_where_letters_are_missing():
     done = shell('"$@"', "train", "--help-all", PYTHONIOENCODING="ascii")
     assert done.returncode == 0 and not done.stderr
     assert b"lambda: weight of the episodic term" in done.stdout.replace(b"\n", b" ")
+
+
+@pytest.mark.parametrize("name", ["evaluate", "report", "dataset", "render"])
+@pytest.mark.parametrize("seed", [-1, 2**31, 10**20])
+def test_a_seed_out_of_range_is_one_sentence(tmp_path, name, seed):
+    files.write_config(tmp_path, preset("smoke"), {}, {})
+    done = commands.call(name, tmp_path, "--seed", seed, expect=2)
+    allowed = "must be 0 or more, and below 2^31 = 2147483648."
+    assert done.stderr == f"error: --seed is {seed}, but {allowed}\n"
 
 
 def test_letters_are_spelled_and_bytes_of_a_file_name_kept():

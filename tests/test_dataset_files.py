@@ -1,6 +1,7 @@
 """Datasets on disk, read as their formats' own readers read them."""
 
 import json
+import shutil
 
 import commands
 import minari
@@ -10,8 +11,9 @@ import pytest
 import maxent_jax
 from maxent_jax.analysis import dataset_files
 from maxent_jax.commands import dataset
-from maxent_jax.errors import SaveError
-from maxent_jax.runs import files
+from maxent_jax.errors import CheckpointCorruptError, SaveError, UsageError
+from maxent_jax.runs import files, source
+from maxent_jax.runs.source import on_task
 
 NUM = 5_000  # two rounds of 32 episodes of at most 100 steps
 pytestmark = pytest.mark.filterwarnings("ignore:.*is out of date:DeprecationWarning")
@@ -178,6 +180,34 @@ def test_bad_input_gives_one_sentence(smoke_run, tmp_path, flags, sentence):
     done = commands.call("dataset", smoke_run, "--out", tmp_path / "out", *flags, expect=2)
     assert sentence in done.stderr and done.stderr.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_the_manifest_names_the_checkpoint_that_was_read(copy_of_smoke_run, tmp_path):
+    directory = copy_of_smoke_run
+    shutil.move(directory / "checkpoints" / "2", tmp_path / "2")
+    run = maxent_jax.load_run(directory)  # while it trains
+    shutil.move(tmp_path / "2", directory / "checkpoints" / "2")
+    dataset_files.write(run, tmp_path / "data", "npz", 100)
+    held = json.loads((tmp_path / "data" / dataset_files.MANIFEST).read_text())
+    assert held["run"]["checkpoint"] == run.checkpoint == "1"
+    later = maxent_jax.load_run(directory)
+    assert later.checkpoint == "2"
+    with pytest.raises(UsageError, match="holds another dataset, with another run"):
+        dataset_files.write(later, tmp_path / "data", "npz", 100)
+
+
+def test_a_damaged_checkpoint_is_passed_over_on_demand(copy_of_smoke_run, tmp_path):
+    directory, out = copy_of_smoke_run, tmp_path / "data"
+    (directory / "checkpoints" / "2" / "arrays" / "results" / "_METADATA").unlink()
+    flags = (directory, "--transitions", "100", "--out", out)
+    assert "--fallback of a command" in commands.call("dataset", *flags, expect=2).stderr
+    with pytest.warns(UserWarning, match="checkpoint 2"):
+        commands.call("dataset", *flags, "--fallback")
+    held = json.loads((out / dataset_files.MANIFEST).read_text())
+    assert held["run"]["checkpoint"] == "1" and held["complete"]
+    with pytest.raises(CheckpointCorruptError) as raised:
+        source.load(on_task(files.read_config(directory), str(directory), "forward"))
+    assert "train --resume --fallback on that run" in str(raised.value)
 
 
 def test_a_directory_with_other_files_is_left_alone(run, tmp_path):

@@ -55,6 +55,15 @@ def test_a_config_that_was_changed_by_hand_is_noticed(run):
         integrity.find(run)
 
 
+def test_the_caller_says_what_can_be_done(run):
+    (run / FOLDER / "10+2" / "arrays" / "data").unlink()
+    said = f"checkpoint 10+2 of {run} is damaged: arrays/data is missing"
+    for remedy, end in (("", "."), ("ask Ada", "; ask Ada.")):
+        with pytest.raises(errors.CheckpointCorruptError) as raised:
+            integrity.find(run, remedy=remedy)
+        assert str(raised.value) == said + end
+
+
 def test_where_all_are_damaged_there_is_nothing_to_fall_back_to(run):
     for name in integrity.checkpoints(run):
         (run / FOLDER / name / MANIFEST).unlink()

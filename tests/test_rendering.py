@@ -242,7 +242,7 @@ def test_without_ffmpeg_the_extra_is_named(monkeypatch):
         ("ant", ("--stills", "0"), "--stills must be from 1"),
         ("ant", ("--size", "130"), "--size must be a multiple of 4"),
         ("ant", ("--speed", "nan"), "--speed must be from"),
-        ("ant", ("--seed", "-1"), "--seed must be 0 or more"),
+        ("ant", ("--seed", "-1"), "--seed is -1, but must be 0 or more"),
         ("ant", ("--spead", "1"), "did you mean --speed"),
     ],
 )

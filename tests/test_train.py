@@ -21,6 +21,8 @@ from maxent_jax import envs, errors
 from maxent_jax.commands import train
 from maxent_jax.config import preset
 from maxent_jax.runs import driver, files, integrity
+from maxent_jax.runs.claim import Claim
+from maxent_jax.visual import plotting
 
 NO_RENDERING = Path(__file__).parent / "no_rendering"
 TINY = ("--preset", "smoke", "--num-segments", "1", "--mixture-episodes", "6")
@@ -109,6 +111,41 @@ def test_a_run_killed_before_its_figures_gets_them_on_resume(finished):
     (finished / "figures" / "curves.png").unlink()
     call("train", "--preset", "smoke", "--out", finished, "--resume")
     assert (finished / "figures" / "curves.png").exists()
+
+
+@pytest.mark.parametrize("trained", [True, False])
+def test_figures_are_drawn_anew_unless_nothing_was_trained(copy_of_smoke_run, monkeypatch, trained):
+    directory = copy_of_smoke_run
+    paths = [directory / "figures" / f"{name}.png" for name in plotting.NAMES]
+    for path in paths:
+        path.write_bytes(b"by evaluate, while the run was training")
+    monkeypatch.setattr(driver, "train", lambda *_: driver.Ended(trained))
+    train.run_to_end(preset("smoke"), directory, time.perf_counter(), driver.AS_USUAL)
+    assert all(path.read_bytes().startswith(b"\x89PNG") == trained for path in paths)
+
+
+def test_the_evaluation_of_another_seed_leaves_the_first_ones(two_seeds, tmp_path):
+    directory = Path(shutil.copytree(two_seeds, tmp_path / "two"))
+    call("evaluate", directory, "--episodes", 1)
+    held = {p: p.read_bytes() for p in directory.rglob("*") if p.suffix in (".png", ".json")}
+    call("evaluate", directory, "--episodes", 1, "--seed-index", 1)
+    assert all(path.read_bytes() == content for path, content in held.items())
+    reports = [directory / name for name in ("evaluation.json", "evaluation_seed_1.json")]
+    seeds = [json.loads(path.read_text())["trained_with_seed"] for path in reports]
+    assert seeds == [0, 1]
+    for name in plotting.NAMES:
+        first, second = (directory / "figures" / place / f"{name}.png" for place in ("", "seed_1"))
+        assert second.read_bytes() not in (b"", first.read_bytes())
+
+
+def test_overwriting_removes_the_evaluations_of_every_seed(tmp_path):
+    config = preset("smoke", num_seeds=2)
+    files.write_config(tmp_path, config, {}, {})
+    for name in ("evaluation.json", "evaluation_seed_1.json", "evaluation_seed_mine.json"):
+        (tmp_path / name).write_text("{}")
+    with Claim(tmp_path, config, overwrite=True).hold():
+        left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"evaluation_seed_mine.json", "lock"}
 
 
 def test_a_run_can_be_looked_at_with_any_number_of_episodes(finished):

@@ -23,12 +23,13 @@ import numpy as np
 from maxent_jax import components, envs
 from maxent_jax.analysis import dataset, gymnasium_play
 from maxent_jax.analysis.run import Run
+from maxent_jax.checks import check_seed
 from maxent_jax.config import tasks
 from maxent_jax.config.registry import MUJOCO_ENVS
 from maxent_jax.envs.task import MujocoEnv
 from maxent_jax.errors import UsageError
 from maxent_jax.precision import in_32_bits
-from maxent_jax.runs import files, integrity, locks
+from maxent_jax.runs import files, locks
 
 MANIFEST = "dataset.json"
 VERSION = 1  # of the layout
@@ -73,8 +74,10 @@ def write(
       report: called with the number of transitions on disk.
     Raises:
       UsageError: the directory holds something else, or the format cannot hold the environment.
+      ConfigError: the seed is out of range.
       SaveError: a file cannot be written; what is complete stays.
     """
+    key = jax.random.key(check_seed("seed", seed))
     content = {
         "version": VERSION,
         "format": form,
@@ -83,7 +86,7 @@ def write(
         "seed": seed,
         "run": {
             "id": files.read_id(run.path),
-            "checkpoint": integrity.checkpoints(run.path)[-1],
+            "checkpoint": run.checkpoint,
             "seed": run.seed,
             "config": run.config.flat(),
         },
@@ -99,7 +102,7 @@ def write(
             on_task,
             run.mixture,
             jnp.asarray(run.weights),
-            jax.random.key(seed),
+            key,
             first=written.rounds,
             physics=form == "exorl",
         )

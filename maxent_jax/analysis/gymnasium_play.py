@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from maxent_jax import analysis, components
 from maxent_jax.analysis import Paths, Run
+from maxent_jax.checks import NUM_SEEDS, check_seed
 from maxent_jax.config import Config
 from maxent_jax.errors import ConfigError
 
@@ -100,22 +101,24 @@ def make(config: Config) -> RunTask:
     return RunTask(env, config)
 
 
-def play(run: Run, policies: ArrayLike, seed: int = 0) -> Paths:
+def play(run: Run, policies: ArrayLike, seed: int = 0, deterministic: bool | None = None) -> Paths:
     """Plays episodes in Gymnasium, one after another.
 
     Args:
       policies: [E] ascending, the policy that plays each episode: `[2] * 5`, or for the mixture
         `mixture.assign_episodes(run.weights, 50, 0.5)`.
       seed: of Gymnasium's starts and of the actions.
+      deterministic: the policies act by their means; None: as the config evaluates.
     Returns:
       The paths of the E episodes.
     Raises:
-      ConfigError: as in `make`.
+      ConfigError: as in `make`, or the seed is out of range.
       IndexError: there is no such policy.
     """
-    policies = np.asarray(policies)
+    policies, seed = np.asarray(policies), check_seed("seed", seed)
     env = make(run.config)
-    acts = {i: jax.jit(run.policy(i)) for i in np.unique(policies).tolist()}
+    mean = run.config.evaluation.deterministic if deterministic is None else deterministic
+    acts = {i: jax.jit(run.policy(i, mean)) for i in np.unique(policies).tolist()}
     length = run.config.environment.episode_length
     states = np.zeros((len(policies), length, run.components.sac.observation_size), np.float32)
     alive = np.zeros((len(policies), length), bool)
@@ -129,18 +132,22 @@ def play(run: Run, policies: ArrayLike, seed: int = 0) -> Paths:
     return Paths(states, alive, policies)
 
 
-def rollout(run: Run, episodes_per_policy: int = 5, seed: int = 0) -> Paths:
+def rollout(
+    run: Run, episodes_per_policy: int = 5, seed: int = 0, deterministic: bool | None = None
+) -> Paths:
     """Plays fresh episodes of each policy in Gymnasium; the counterpart of `Run.rollout`."""
-    return play(run, np.repeat(np.arange(run.num_policies), episodes_per_policy), seed)
+    policies = np.repeat(np.arange(run.num_policies), episodes_per_policy)
+    return play(run, policies, seed, deterministic)
 
 
 def gap(run: Run, episodes_per_policy: int = 5, seed: int = 0) -> dict[str, Gap]:
     """Compares each measure of the same policies in Gymnasium and in our simulator.
 
     Gymnasium plays one set of episodes, and our simulator NUM_SETS sets of the same size. Two sets
-    in our simulator also differ by about `chance`, so a smaller difference means nothing.
+    in our simulator also differ by about `chance`, so a smaller difference means nothing. One
+    policy plays each episode, also in runs with `mixing` step, whose mixture is another.
     """
-    seeds = range(seed, seed + NUM_SETS)
+    seeds = [(check_seed("seed", seed) + i) % NUM_SEEDS for i in range(NUM_SETS)]
     theirs = measures(run, rollout(run, episodes_per_policy, seed), seed)
     ours = [measures(run, run.rollout(episodes_per_policy, s), s) for s in seeds]
     return {name: _gap([each[name] for each in ours], value) for name, value in theirs.items()}

@@ -14,8 +14,8 @@ from jax.export import Exported
 
 from maxent_jax import components, errors, mixture
 from maxent_jax.algorithm import methods
-from maxent_jax.analysis import dataset, export
-from maxent_jax.checks import check_path, check_whole
+from maxent_jax.analysis import dataset, export, weighing
+from maxent_jax.checks import check_path, check_seed, check_whole
 from maxent_jax.components import Components
 from maxent_jax.config import Config, tasks
 from maxent_jax.config.registry import CORRECTIVE
@@ -36,7 +36,7 @@ class Paths(NamedTuple):
 
     states: np.ndarray  # [E, T, D]
     alive: np.ndarray  # [E, T] bool: reached before the episode's end
-    policy: np.ndarray  # [E] int, ascending
+    policy: np.ndarray  # [E] int, ascending; -1 if policies were drawn at each step
 
 
 class Summary(NamedTuple):
@@ -50,9 +50,12 @@ class Summary(NamedTuple):
     mean_end: list[float]  # on the grid's axes
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Run:
-    """One seed of a run; `metrics` are columns with one entry per iteration, [T] or [T, ...]."""
+    """One seed of a run; `metrics` are columns with one entry per iteration, [T] or [T, ...].
+
+    A run equals only itself, because its arrays have no single truth value.
+    """
 
     path: Path
     config: Config
@@ -61,6 +64,7 @@ class Run:
     mixture: Archive
     histogram: np.ndarray  # [bins, bins] states visited in training
     random_histogram: np.ndarray  # [bins, bins] states visited by the random baseline
+    checkpoint: str = ""  # name of the one that was loaded; empty for a run made in memory
 
     @property
     def num_policies(self) -> int:
@@ -100,27 +104,34 @@ class Run:
         """Returns phi(s), [..., D] -> [..., F]; `components.phi.names` names the features."""
         return self.components.phi(jnp.asarray(states))
 
-    def policy(self, index: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
+    def policy(
+        self, index: int, deterministic: bool = False
+    ) -> Callable[[jax.Array, jax.Array], jax.Array]:
         """Returns a policy as a function: state [..., D], key -> action [..., A] in [-1, 1].
 
         The function raises ValueError if a state is not [..., D].
 
+        Args:
+          index: of the policy; 0 is the untrained one.
+          deterministic: act by the tanh of the Gaussian's mean; the key then changes nothing.
         Raises:
           IndexError: there is no policy `index`.
         """
-        return functools.partial(_act, self.components, self._policy(index))
+        return functools.partial(_act, self.components, self._policy(index), deterministic)
 
     @in_32_bits
     def act(self, s: jax.Array, key: jax.Array, policy: int | None = None) -> jax.Array:
         """Draws actions [..., A] for states [..., D] by `policy`, or by one drawn by weight.
 
         The mixture draws a policy once per episode. To play it, draw one and use `Run.policy`.
+        Without `policy`, it is drawn on the host at each call, so the call cannot be jitted.
         """
         key_draw, key_act = jax.random.split(key)
         if policy is None:
             policy = int(jax.random.choice(key_draw, self.weights.shape[0], p=self.weights))
         return self.policy(policy)(s, key_act)
 
+    @in_32_bits
     def export_policy(self, index: int, deterministic: bool = False) -> Exported:
         """Exports a policy for use without this package; see `export.policy` for how to call it.
 
@@ -130,49 +141,98 @@ class Run:
         return export.policy(self.components.sac, self._policy(index), deterministic)
 
     @in_32_bits
-    def occupancy(self, episodes_per_policy: int = 5, seed: int = 0) -> Occupancy:
-        """Plays fresh episodes of each policy, and weighs the states as the mixture does.
+    def occupancy(
+        self,
+        episodes_per_policy: int = 5,
+        seed: int = 0,
+        deterministic: bool | None = None,
+        by_policy: bool = False,
+    ) -> Occupancy:
+        """Plays fresh episodes of the mixture, and weighs their states, as training evaluates it.
 
+        Each policy plays equally often, and its states share its weight. With `pooled`, policies
+        are drawn by weight instead. With `mixing` step, they are drawn at each step: no episode
+        belongs to one policy, and `policy` and `episode_policy` are -1.
+
+        Args:
+          episodes_per_policy: times `num_policies` is the number of episodes in all.
+          seed: of starts and actions.
+          deterministic: the policies act by their means; None: as the config evaluates.
+          by_policy: each policy plays equally often in any case. This changes nothing unless the
+            config has `pooled` or `mixing` step. With `pooled`, every episode then counts by the
+            weight of its policy; with `mixing` step, the states of a policy share its weight, and
+            the occupancy is not that of the mixture.
         Raises:
-          ValueError: episodes_per_policy < 1, or the episodes do not fit into memory.
+          ValueError: episodes_per_policy < 1, the seed is out of range, or the episodes do not fit
+            into memory.
         """
         check_whole("episodes_per_policy", episodes_per_policy, least=1)
         memory.check_episodes(self.config, episodes_per_policy * self.num_policies)
-        key_starts, key_play = jax.random.split(jax.random.key(seed))
+        key_starts, key_play = jax.random.split(_key(seed))
         num_episodes = episodes_per_policy * self.num_policies
-        by_policy = self._components_by_policy
-        starts = jax.vmap(by_policy.env.reset)(jax.random.split(key_starts, num_episodes))
+        mean = self.config.evaluation.deterministic if deterministic is None else deterministic
+        playing = self._components_by_policy if by_policy else self.components
+        starts = jax.vmap(playing.env.reset)(jax.random.split(key_starts, num_episodes))
         weights = jnp.asarray(self.weights)
-        return _of_mixture(by_policy, self.mixture, weights, starts, key_play)
+        found = _of_mixture(playing, self.mixture, weights, starts, key_play, False, bool(mean))
+        if by_policy:
+            return self._weighed(found)
+        if self.config.mixture.mixing == "step":
+            nobody, nobodys = -jnp.ones_like(found.episode_policy), -jnp.ones_like(found.policy)
+            return found._replace(episode_policy=nobody, policy=nobodys)
+        return found
+
+    def occupancies(
+        self, episodes_per_policy: int = 5, seed: int = 0
+    ) -> tuple[Occupancy, Occupancy]:
+        """Returns the occupancy to measure, and the one by policy, for scores and paths.
+
+        They are the same object unless the config has `pooled` or `mixing` step.
+        """
+        visited = self.occupancy(episodes_per_policy, seed)
+        if not self.config.mixture.pooled and self.config.mixture.mixing == "episode":
+            return visited, visited
+        return visited, self.occupancy(episodes_per_policy, seed, by_policy=True)
 
     @in_32_bits
     def occupancy_of(self, episodes: Paths) -> Occupancy:
         """Makes the occupancy of given episodes, at least one of each policy.
 
+        It is weighted as `occupancy(by_policy=True)` is.
+
         Raises:
           ValueError: a policy has no episode, or an episode's policy is not in the mixture.
         """
-        played = set(np.unique(episodes.policy).tolist())
-        if played != set(range(self.num_policies)):
-            raise ValueError(
-                f"episodes are of policies {sorted(played)}, but must be of all policies from 0 to "
-                f"{self.num_policies - 1}"
-            )
+        self._check_all_played(episodes.policy)
         states = jnp.asarray(episodes.states).swapaxes(0, 1)
         alive = jnp.asarray(episodes.alive).T
         policy, none = jnp.asarray(episodes.policy, jnp.int32), jnp.zeros((), jnp.int32)
         weights = jnp.asarray(self.weights)
-        return _of_episodes(self._components_by_policy, weights, policy, states, alive, none)
+        by_policy = self._components_by_policy
+        return self._weighed(_of_episodes(by_policy, weights, policy, states, alive, none))
 
-    def rollout(self, episodes_per_policy: int = 5, seed: int = 0) -> Paths:
-        """Plays fresh episodes of each policy and returns their paths."""
-        return paths(self.occupancy(episodes_per_policy, seed))
+    def rollout(
+        self, episodes_per_policy: int = 5, seed: int = 0, deterministic: bool | None = None
+    ) -> Paths:
+        """Plays fresh episodes of each policy and returns their paths.
+
+        Args:
+          episodes_per_policy: how many; one policy plays each, also with `mixing` step.
+          seed: of starts and actions.
+          deterministic: the policies act by their means; None: as the config evaluates.
+        Raises:
+          ValueError: episodes_per_policy < 1, the seed is out of range, or the episodes do not fit
+            into memory.
+        """
+        return paths(self.occupancy(episodes_per_policy, seed, deterministic, by_policy=True))
 
     @in_32_bits
     def dataset(self, n: int, seed: int = 0, task: str = tasks.NONE) -> dict[str, np.ndarray]:
         """Collects `n` transitions of the mixture's fresh episodes, for offline RL.
 
         `np.savez_compressed(path, **run.dataset(n))` saves them; `dataset.collect` lists the keys.
+        One policy, which draws its actions, plays each episode, also with `mixing` step and
+        `deterministic`.
 
         Args:
           n: how many.
@@ -180,23 +240,27 @@ class Run:
           task: adds the rewards of this task, by name as in `config.tasks`; none adds none.
         Raises:
           ValueError: n < 1, or the transitions do not fit into memory.
-          ConfigError (a ValueError): the environment has no such task.
+          ConfigError (a ValueError): the environment has no such task, or the seed is out of range.
         """
         dataset.check(self.config, n)
+        key = _key(seed)
         on_task = components.with_task(self.components, task)
-        weights, key = jnp.asarray(self.weights), jax.random.key(seed)
-        return dataset.collect(on_task, self.mixture, weights, n, key)
+        return dataset.collect(on_task, self.mixture, jnp.asarray(self.weights), n, key)
 
     @in_32_bits
     def scores(self, visited: Occupancy, seed: int = 0) -> Scores:
-        """Scores each policy by its return under the reward that these states define."""
-        key = jax.random.key(seed)
+        """Scores each policy by its return under the reward that these states define.
+
+        Raises:
+          ValueError: a policy has no episode; `occupancy(by_policy=True)` has some of each.
+        """
+        self._check_all_played(visited.episode_policy)
         size = self.config.mixture.reference_size
-        rows = mixture.draw_rows(visited.weight, size, key, visited.num_episodes)
+        rows = mixture.draw_rows(visited.weight, size, _key(seed), visited.num_episodes)
         return _score(self.components, visited, visited.features[rows], rows, self.mixture)
 
     def summaries(self, visited: Occupancy, seed: int = 0) -> list[Summary]:
-        """Summarises the episodes in `visited`, policy by policy."""
+        """Summarises the episodes in `visited`, policy by policy; raises as `scores` does."""
         episodes, scores, weights = paths(visited), self.scores(visited, seed), self.weights
         ends = mean_ends(self, episodes)
         return [
@@ -213,8 +277,12 @@ class Run:
 
     @in_32_bits
     def measures(self, visited: Occupancy, seed: int = 0) -> dict[str, float]:
-        """Measures the mixture's coverage and entropies (nats), named as in the metrics."""
-        measured = occupancy.measures(self.components, visited, jax.random.key(seed))
+        """Measures the mixture's coverage and entropies (nats), named as in the metrics.
+
+        Episodes of policies of weight 0 do not count, as in training, which does not play them.
+        """
+        visited = weighing.without_weightless(visited, self.weights)
+        measured = occupancy.measures(self.components, visited, _key(seed))
         return {name: value.item() for name, value in measured.items()}
 
     @in_32_bits
@@ -228,6 +296,20 @@ class Run:
         """The components with which policies play equally often, whatever the config says."""
         return components.make(self.config.replace(pooled=False, mixing="episode"))
 
+    def _weighed(self, visited: Occupancy) -> Occupancy:
+        """Episodes of which each belongs to one policy, weighted as the config says."""
+        pools = self.config.mixture.pooled
+        return weighing.pooled(visited, self.weights) if pools else visited
+
+    def _check_all_played(self, episode_policy: jax.Array | np.ndarray) -> None:
+        """Raises ValueError unless the episodes are of all policies of the mixture."""
+        played = set(np.unique(episode_policy).tolist())
+        if played != set(range(self.num_policies)):
+            raise ValueError(
+                f"episodes are of policies {sorted(played)}, but must be of all policies from 0 to "
+                f"{self.num_policies - 1}: play them by rollout, or by occupancy(by_policy=True)"
+            )
+
     def _policy(self, index: int) -> Policy:
         check_whole("policy", index)
         if not -self.num_policies <= index < self.num_policies:
@@ -238,15 +320,25 @@ class Run:
         return mixture.policy(self.mixture, jnp.asarray(index % self.num_policies)).policy
 
 
+def _key(seed: int) -> jax.Array:
+    return jax.random.key(check_seed("seed", seed))
+
+
 @in_32_bits
-def _act(components: Components, policy: Policy, states: jax.Array, key: jax.Array) -> jax.Array:
+def _act(
+    components: Components,
+    policy: Policy,
+    deterministic: bool,
+    states: jax.Array,
+    key: jax.Array,
+) -> jax.Array:
     size = components.sac.observation_size
     if jnp.shape(states)[-1:] != (size,):
         raise ValueError(f"states have shape {jnp.shape(states)}, but must be [..., {size}]")
-    return agent.act(components.sac, policy, jnp.asarray(states, jnp.float32), key)
+    return agent.act(components.sac, policy, jnp.asarray(states, jnp.float32), key, deterministic)
 
 
-_of_mixture = jax.jit(occupancy.of_mixture, static_argnums=0)
+_of_mixture = jax.jit(occupancy.of_mixture, static_argnums=(0, 5, 6))
 _of_episodes = jax.jit(occupancy.of_episodes, static_argnums=0)
 _score = jax.jit(occupancy.score, static_argnums=0)
 
@@ -283,7 +375,8 @@ def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> R
             f"seed_index is {seed_index}, but {directory} has {config.num_seeds} "
             f"{'seed' if config.num_seeds == 1 else 'seeds'}, counted from 0."
         )
-    name, passed_over = integrity.find(directory, whole=False, fallback=fallback)
+    remedy = "load_run(..., fallback=True), or --fallback of a command, uses the one before"
+    name, passed_over = integrity.find(directory, whole=False, fallback=fallback, remedy=remedy)
     for sentence in passed_over.values():
         warnings.warn(sentence, stacklevel=2)
     results = checkpoint.restore_results(directory, name, config)
@@ -299,6 +392,7 @@ def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> R
         mixture=results.archive,
         histogram=np.asarray(results.visits.cells),
         random_histogram=np.asarray(results.random_visits.cells),
+        checkpoint=name,
     )
 
 

@@ -1,7 +1,8 @@
 """Writes a dataset of a run's mixture: transitions for offline reinforcement learning.
 
 The dataset is written a few episodes at a time, so it may be larger than the memory. The same
-command continues a dataset that was stopped.
+command continues a dataset that was stopped. One policy plays each episode, also in runs with
+--mixing step.
 """
 
 import dataclasses
@@ -12,7 +13,7 @@ from typing import Annotated
 import tyro
 
 from maxent_jax import errors
-from maxent_jax.checks import check_choice
+from maxent_jax.checks import check_choice, check_seed
 from maxent_jax.commands import cli
 from maxent_jax.config import tasks
 from maxent_jax.runs import files, integrity, runtime
@@ -37,6 +38,8 @@ class Arguments:
     """Seed of the episodes."""
     seed_index: int = 0
     """Which seed of the run, from 0, if it trained several."""
+    fallback: bool = False
+    """If the last checkpoint is damaged, use the one before."""
     out: Path | None = None
     """The dataset's directory; if left out, DIRECTORY-FORMAT."""
     modules: cli.Modules = ()
@@ -52,8 +55,9 @@ def main(argv: Sequence[str]) -> None:
     cli.import_modules(argv)
     arguments = cli.parse(Arguments, argv, "dataset")
     check_choice("format", arguments.format, FORMATS)
-    if arguments.transitions < 1 or arguments.seed < 0:
-        raise errors.UsageError("--transitions must be at least 1, and --seed must be 0 or more.")
+    if arguments.transitions < 1:
+        raise errors.UsageError("--transitions must be at least 1.")
+    check_seed("--seed", arguments.seed)
     config = files.read_config(arguments.directory)
     config.check_registered()
     if arguments.task != tasks.NONE:
@@ -68,7 +72,7 @@ def main(argv: Sequence[str]) -> None:
     from maxent_jax.analysis import dataset_files, load_run
     from maxent_jax.runs.progress import counting
 
-    run = load_run(arguments.directory, arguments.seed_index)
+    run = load_run(arguments.directory, arguments.seed_index, arguments.fallback)
     with counting(arguments.transitions, "transitions") as report:
         dataset_files.write(
             run,

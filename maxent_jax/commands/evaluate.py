@@ -1,7 +1,8 @@
 """Loads a run, rolls out its mixture again, and reports what it covers.
 
-Prints a table and writes evaluation.json and figures/ into the run's directory. With --gymnasium it
-also rolls out the policies in Gymnasium's own environment and reports the sim-to-sim gap.
+Prints a table and writes evaluation.json and figures/ into the run's directory, for --seed-index 1
+evaluation_seed_1.json and figures/seed_1/. With --gymnasium it also rolls out the policies in
+Gymnasium's own environment and reports the sim-to-sim gap.
 """
 
 import dataclasses
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from maxent_jax import errors
+from maxent_jax.checks import check_seed
 from maxent_jax.commands import cli
 from maxent_jax.runs import files, integrity, runtime
 from maxent_jax.visual import headless
@@ -48,8 +50,9 @@ def main(argv: Sequence[str]) -> None:
     """
     cli.import_modules(argv)
     arguments = cli.parse(Arguments, argv, "evaluate")
-    if arguments.episodes < 1 or arguments.seed < 0:
-        raise errors.UsageError("--episodes must be at least 1, and --seed must be 0 or more.")
+    if arguments.episodes < 1:
+        raise errors.UsageError("--episodes must be at least 1.")
+    check_seed("--seed", arguments.seed)
     config = files.read_config(arguments.directory)
     config.check_registered()
     integrity.check_any(arguments.directory)
@@ -61,7 +64,7 @@ def main(argv: Sequence[str]) -> None:
 
         gymnasium_play.make(config).close()  # fails here rather than after the rollouts
     report = evaluate(arguments)
-    files.write_json(arguments.directory / "evaluation.json", report)
+    files.write_json(files.evaluation(arguments.directory, arguments.seed_index), report)
     _print(report)
 
 
@@ -74,8 +77,8 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
     from maxent_jax.visual import plotting
 
     run = analysis.load_run(arguments.directory, arguments.seed_index, arguments.fallback)
-    visited = run.occupancy(arguments.episodes, arguments.seed)
-    plotting.save_all(run, visited)
+    visited, by_policy = run.occupancies(arguments.episodes, arguments.seed)
+    plotting.save_all(run, visited, by_policy)
     return {
         "run": str(run.path),
         "trained_with_seed": run.seed,
@@ -84,7 +87,7 @@ def evaluate(arguments: Arguments) -> dict[str, Any]:
         "reward": run.config.intrinsic.reward,
         "coordinates": run.components.grid.names,
         "deviations_from_the_paper": run.config.deviations(),
-        "policies": [s._asdict() for s in run.summaries(visited, arguments.seed)],
+        "policies": [s._asdict() for s in run.summaries(by_policy, arguments.seed)],
         "training_coverage": int((run.histogram > 0).sum()),
         "training_entropy": float(histogram.shannon_entropy(jnp.asarray(run.histogram))),
         **(

@@ -1,7 +1,8 @@
 """Films a run's archived policies, one by one and together, without a screen.
 
 Writes into videos/ of the run's directory: policy_<i>.mp4 and policy_<i>.png (a strip of stills)
-for each policy, and mixture.mp4 and mixture.png with all policies together.
+for each policy, and mixture.mp4 and mixture.png with all policies together. One policy plays each
+episode, also in runs with --mixing step.
 """
 
 import dataclasses
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from maxent_jax import errors
+from maxent_jax.checks import check_seed
 from maxent_jax.commands import cli
 from maxent_jax.runs import files, integrity, progress, runtime
 from maxent_jax.visual import headless, video
@@ -96,10 +98,10 @@ def _check(arguments: Arguments, num_policies: int) -> None:
             not 1 <= arguments.stills <= MOST_STILLS,
             f"--stills must be from 1 to {MOST_STILLS}.",
         ),
-        (arguments.seed < 0, "--seed must be 0 or more."),
     ):
         if wrong:
             raise errors.UsageError(sentence)
+    check_seed("--seed", arguments.seed)
 
 
 def _film(arguments: Arguments) -> None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from maxent_jax import errors
+from maxent_jax.checks import check_seed
 from maxent_jax.commands import cli, render
 from maxent_jax.runs import files, integrity, progress, runtime
 from maxent_jax.visual import headless
@@ -73,8 +74,9 @@ def _check(arguments: Arguments) -> Path:
         raise errors.UsageError("no run is given: name the directory of one run, or of several.")
     if len(set(directories)) < len(directories):
         raise errors.UsageError("a directory is named twice: name each run once.")
-    if arguments.episodes < 1 or arguments.seed < 0:
-        raise errors.UsageError("--episodes must be at least 1, and --seed must be 0 or more.")
+    if arguments.episodes < 1:
+        raise errors.UsageError("--episodes must be at least 1.")
+    check_seed("--seed", arguments.seed)
     here = directories[0] if len(directories) == 1 else Path()
     path = arguments.out or here / "report.html"
     if path.is_dir() or not path.parent.is_dir():
@@ -143,15 +145,15 @@ def _seed_section(run: "Run", seed_index: int, arguments: Arguments) -> dict[str
     from maxent_jax import analysis
     from maxent_jax.visual import plotting, tables
 
-    visited = run.occupancy(arguments.episodes, arguments.seed)
+    visited, by_policy = run.occupancies(arguments.episodes, arguments.seed)
     return {
         "seed": run.seed,
         "curves": _svg(plotting.curves(run)) if run.metrics else None,
         "occupancy": _svg(plotting.occupancy_map(run, run.mixture_cells(visited))),
-        "fireworks": _svg(plotting.fireworks(run, analysis.paths(visited))),
+        "fireworks": _svg(plotting.fireworks(run, analysis.paths(by_policy))),
         "strip": _strip(run, seed_index),
         "iterations": tables.iterations(run),
-        "policies": tables.policies(run, visited, arguments.seed),
+        "policies": tables.policies(run, by_policy, arguments.seed),
         "measures": tables.measures(run.measures(visited, arguments.seed)),
         "episodes": arguments.episodes,
     }

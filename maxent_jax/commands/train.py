@@ -264,14 +264,16 @@ def train(config: Config, out: str | Path, resume: bool = False, overwrite: bool
 
 
 def run_to_end(config: Config, directory: Path, started: float, options: "Options") -> int | None:
-    """Trains the rest of the run and draws its figures; see `driver.train`."""
+    """Trains the rest of the run and draws its figures; returns `driver.Ended.received`."""
     from maxent_jax.runs import driver, hosts  # loads jax
-    from maxent_jax.visual import figures
+    from maxent_jax.visual import figures, plotting
 
-    received = driver.train(config, directory, started, options)
+    ended = driver.train(config, directory, started, options)
     if hosts.is_first():
+        if ended.trained:  # `evaluate` may have drawn what the run was before
+            plotting.remove_saved(directory)
         figures.draw_missing(directory)
-    return received
+    return ended.received
 
 
 def _print_figures(directory: Path) -> None:

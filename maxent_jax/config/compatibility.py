@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Iterator
 from types import SimpleNamespace
 
+from maxent_jax.checks import NUM_SEEDS
 from maxent_jax.config import names, registry, tasks
 from maxent_jax.config.registry import CORRECTIVE, EnvironmentRow
 
@@ -32,7 +33,7 @@ def _budget(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
     updates = _updates(c)
     if updates < 0.5 or abs(updates - round(updates)) > 1e-6:
         yield f"updates-per-step × num-envs is {updates:g}, but must be a whole number above 0."
-    if c.seed + c.num_seeds > 2**31:
+    if c.seed + c.num_seeds > NUM_SEEDS:
         yield f"seed + num-seeds is {c.seed + c.num_seeds}, but must not exceed 2^31."
     env_steps = c.num_iterations * c.steps_per_iteration
     if env_steps > MOST:

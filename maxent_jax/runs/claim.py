@@ -110,8 +110,7 @@ def _is_of_a_beginning(path: Path) -> bool:
 
 def _remove_run(directory: Path) -> None:
     """Removes all that a run writes, and nothing else."""
-    for name in files.WRITTEN:
-        path = directory / name
+    for path in [path for path in directory.iterdir() if files.is_written(path.name)]:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         else:

@@ -35,6 +35,13 @@ class Options(NamedTuple):
 AS_USUAL = Options()
 
 
+class Ended(NamedTuple):
+    """How a run reached its end."""
+
+    trained: bool  # False: it was complete before
+    received: int | None = None  # the signal of the last iteration, too late to stop the run
+
+
 def check(config: Config, options: Options = AS_USUAL) -> None:
     """Rejects a run that is impossible here, before anything is compiled or written.
 
@@ -47,14 +54,14 @@ def check(config: Config, options: Options = AS_USUAL) -> None:
 
 def train(
     config: Config, directory: Path, process_started: float, options: Options = AS_USUAL
-) -> int | None:
+) -> Ended:
     """Trains a run to its end, from its last checkpoint if there is one.
 
     Args:
       directory: an existing directory, empty or with this run in it.
       process_started: time.perf_counter() when the program began, for the time to the first step.
     Returns:
-      The signal that arrived in the last iteration, too late to stop the run; None without one.
+      Whether there was anything to train, and the signal that arrived in the last iteration.
     Raises:
       UsageError, ConfigError: see `check`; or the run cannot start from its source.
       CheckpointCorruptError: the last checkpoint is damaged.
@@ -71,7 +78,7 @@ def train(
         hosts.leave()
         if hosts.is_first():
             print(f"{directory} is complete: nothing to train.")
-        return None
+        return Ended(trained=False)
     if progress is None:  # a run that continues no longer needs its source
         source.check(config)
     if hosts.is_first():
@@ -85,7 +92,7 @@ def train(
     hosts.leave()
     if hosts.is_first():
         _summarise(config, directory, rows)
-    return received
+    return Ended(trained=True, received=received)
 
 
 def _chosen(num_devices: int) -> list[jax.Device]:
@@ -136,7 +143,8 @@ def _last_progress(directory: Path, options: Options) -> Progress | None:
     """Progress of the checkpoint to continue from, if any; resets the metrics to it."""
     if not integrity.checkpoints(directory):
         return None
-    name, passed_over = integrity.find(directory, fallback=options.fallback)
+    remedy = "the command train --resume --fallback removes it, and uses the one before"
+    name, passed_over = integrity.find(directory, fallback=options.fallback, remedy=remedy)
     progress, computed_with = checkpoint.read_progress(directory, name)
 
     def go_back_to_it() -> None:
@@ -173,7 +181,7 @@ def _train(
     process_started: float,
     options: Options,
 ) -> tuple[list[dict[str, Any]], int | None]:
-    """Trains the remaining iterations; returns the rows of all iterations, and `train`'s signal."""
+    """Trains the remaining iterations; returns the rows of all of them, and `Ended.received`."""
     state, progress = stage
     done = len(progress.rows)
     clock = Clock(process_started, progress.clock)

@@ -23,9 +23,10 @@ RESUMABLE = (6, 7)  # schemas with the same arrays for the whole state
 REMOVED = {"restart_actor": False}  # settings of older schemas, with the value now fixed
 CONFIG, METRICS, FIGURES = "config.json", "metrics.jsonl", "figures"
 FIRST = "first_episodes.json"  # of a run that starts from another
-# All that any command writes there.
+EVALUATION = "evaluation.json"  # of the first seed; see `evaluation`
+# All that any command writes there, but for the evaluations of the other seeds.
 WRITTEN = (
-    *(CONFIG, METRICS, FIRST, FIGURES, "checkpoints", "evaluation.json"),
+    *(CONFIG, METRICS, FIRST, FIGURES, "checkpoints", EVALUATION),
     *("videos", "report.html", "tensorboard", "wandb"),
 )
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "flax", "optax", "orbax-checkpoint")
@@ -94,6 +95,16 @@ def _ungrouped(settings: dict[str, Any]) -> dict[str, Any]:
     for name, value in settings.items():
         flat |= value if isinstance(value, dict) else {name: value}
     return {n: x for n, x in flat.items() if not (n in REMOVED and REMOVED[n] == x)}
+
+
+def evaluation(directory: Path, seed_index: int = 0) -> Path:
+    """Returns the file for the evaluation of a seed, counted from 0."""
+    return directory / (f"evaluation_seed_{seed_index}.json" if seed_index else EVALUATION)
+
+
+def is_written(name: str) -> bool:
+    """Whether a command writes a file or folder of this name into a run's directory."""
+    return name in WRITTEN or re.fullmatch(r"evaluation_seed_\d+\.json", name) is not None
 
 
 def check_resumable(directory: Path) -> None:

@@ -40,13 +40,14 @@ def clear_unfinished(run_directory: Path) -> None:
 
 
 def find(
-    run_directory: Path, whole: bool = True, fallback: bool = False
+    run_directory: Path, whole: bool = True, fallback: bool = False, remedy: str = ""
 ) -> tuple[str, dict[str, str]]:
     """Finds the latest checkpoint, and compares each of its files with its checksum.
 
     Args:
       whole: include the replay, which is otherwise not read.
       fallback: skip damaged checkpoints.
+      remedy: what the user can do about a damaged one; ends the message, if any.
     Returns:
       Its name, and by name a sentence on each checkpoint that was skipped.
     Raises:
@@ -59,15 +60,15 @@ def find(
         if damage is None:
             return name, passed_over
         if not (run_directory / FOLDER / name).exists():  # its run has continued, and removed it
-            return find(run_directory, whole, fallback)
+            return find(run_directory, whole, fallback, remedy)
         sentence = f"checkpoint {name} of {run_directory} is damaged: {damage}"
         if not fallback:
-            raise CheckpointCorruptError(f"{sentence}; --fallback uses the one before.")
+            raise CheckpointCorruptError(f"{sentence}{remedy and '; '}{remedy}.")
         passed_over[name] = f"{sentence}."
     if passed_over:
         raise CheckpointCorruptError(f"{sentence}, and no earlier one is intact.")
     check_any(run_directory)
-    return find(run_directory, whole, fallback)  # one was saved meanwhile
+    return find(run_directory, whole, fallback, remedy)  # one was saved meanwhile
 
 
 def check_any(run_directory: Path) -> None:

@@ -92,7 +92,10 @@ def load(config: Config) -> "tuple[Archive, str]":
 
     directory = Path(config.downstream.source)
     of_source = files.read_config(directory)
-    name, _ = integrity.find(directory, whole=False)
+    remedy = (
+        "the command train --resume --fallback on that run removes it, and repeats what it held"
+    )
+    name, _ = integrity.find(directory, whole=False, remedy=remedy)
     archive = checkpoint.restore_results(directory, name, of_source).archive
     if of_source.num_seeds > 1:
         archive = jax.tree.map(lambda x: x[config.downstream.source_seed], archive)

@@ -256,10 +256,10 @@ def occupancies(directories: Mapping[str, Path]) -> Figure:
     axes = figure.subplots(len(directories), 3, squeeze=False)
     for row, (method, directory) in zip(axes, directories.items(), strict=True):
         run = load_run(directory)
-        visited = run.occupancy()
+        visited, by_policy = run.occupancies()
         plotting.draw_occupancy(row[0], run, run.histogram / max(run.histogram.sum(), 1))
         plotting.draw_occupancy(row[1], run, run.mixture_cells(visited))
-        plotting.draw_paths(row[2], run, paths(visited))
+        plotting.draw_paths(row[2], run, paths(by_policy))
         for ax, what in zip(row, ("training", "mixture", "one colour per policy"), strict=True):
             ax.set_title(f"{method}: {what}")
     return figure

@@ -11,6 +11,7 @@ from maxent_jax.analysis import load_run
 from maxent_jax.config import registry
 from maxent_jax.visual import plotting
 
+EPISODES = 5  # of each policy
 EPISODES_WITH_SKILLS = 16  # of each policy, so that the newest one shows skills all around
 
 
@@ -42,4 +43,5 @@ def _draw(directory: Path, modules: Sequence[str] = ()) -> None:
     registry.import_modules(modules)
     run = load_run(directory)
     with_skills = run.config.environment.skill_size > 0
-    plotting.save_all(run, run.occupancy(EPISODES_WITH_SKILLS) if with_skills else run.occupancy())
+    episodes = EPISODES_WITH_SKILLS if with_skills else EPISODES
+    plotting.save_all(run, *run.occupancies(episodes))

@@ -18,7 +18,7 @@ from maxent_jax.config import tasks
 from maxent_jax.density import histogram
 from maxent_jax.density.histogram import Grid
 from maxent_jax.mixture.occupancy import Occupancy
-from maxent_jax.runs.files import FIGURES, whole_file
+from maxent_jax.runs.files import FIGURES, whole_file, writing
 
 COVERAGE_AXES = (
     ("iteration", "iteration"),
@@ -218,20 +218,42 @@ def _skill_color(angle: float) -> np.ndarray:
     return np.array(matplotlib.colormaps["hsv"](angle / (2 * np.pi) % 1.0))
 
 
-def save_all(run: Run, visited: Occupancy) -> None:
-    """Saves the three figures of a run, with the states that its mixture visited."""
+def save_all(run: Run, visited: Occupancy, by_policy: Occupancy) -> None:
+    """Saves the three figures of a run; the occupancies are those of `Run.occupancies`."""
     drawn = (
         curves(run),
         occupancy_map(run, run.mixture_cells(visited)),
-        fireworks(run, analysis.paths(visited)),
+        fireworks(run, analysis.paths(by_policy)),
     )
+    seed_index = run.seed - run.config.seed
     for name, figure in zip(NAMES, drawn, strict=True):
-        save(figure, run.path / FIGURES, name)
+        save(figure, folder(run.path, seed_index), name)
+
+
+def folder(run_directory: Path, seed_index: int = 0) -> Path:
+    """Returns the folder of a seed's figures; the first seed's lie beside the others' folders."""
+    figures = run_directory / FIGURES
+    return figures / f"seed_{seed_index}" if seed_index else figures
 
 
 def all_saved(run_directory: Path) -> bool:
-    """Whether the run's directory holds the three figures."""
-    return all((run_directory / FIGURES / f"{name}.png").exists() for name in NAMES)
+    """Whether the run's directory holds the three figures of its first seed."""
+    return all(path.exists() for path in _saved(run_directory))
+
+
+def remove_saved(run_directory: Path) -> None:
+    """Removes the three figures of the run's first seed.
+
+    Raises:
+      SaveError: a figure cannot be removed.
+    """
+    for path in _saved(run_directory):
+        with writing(path):
+            path.unlink(missing_ok=True)
+
+
+def _saved(run_directory: Path) -> list[Path]:
+    return [folder(run_directory) / f"{name}.png" for name in NAMES]
 
 
 def save(figure: Figure, directory: Path, name: str) -> Path:

@@ -121,8 +121,8 @@ def iterations(run: Run) -> Table:
     return Table(["iteration", *(text for _, text, _ in measured)], rows)
 
 
-def policies(run: Run, visited: Occupancy, seed: int) -> Table:
-    """Makes one row for each policy: what it does in new episodes."""
+def policies(run: Run, by_policy: Occupancy, seed: int) -> Table:
+    """Makes one row for each policy: what it does in new episodes, which it plays alone."""
     where = ", ".join(run.components.grid.names)
     rows = [
         [
@@ -133,7 +133,7 @@ def policies(run: Run, visited: Occupancy, seed: int) -> Table:
             number(summary.episode_length, ",.0f"),
             ", ".join(number(end, ".1f") for end in summary.mean_end),
         ]
-        for summary in run.summaries(visited, seed)
+        for summary in run.summaries(by_policy, seed)
     ]
     head = ["policy", "weight", "return", "reward per step", "steps per episode"]
     colors = [
