@@ -179,7 +179,7 @@ def test_a_share_of_the_episodes_begins_within_earlier_ones(share, key):
     episodes = base.init(LINE, many, 64, key)
     within = jax.vmap(LINE.reset)(jax.random.split(key, 8))
     within = within.replace(obs=within.obs + 2.0, pipeline_state=ages.astype(jnp.float32))
-    episodes = base.with_restarts(episodes, within, base.Restarts(jnp.asarray(share), ages))
+    episodes = base.with_restarts(episodes, within, base.Restarts(jnp.full(many, share), ages))
     assert base.only_starts(episodes).done.shape == (64,)
     for begun in (
         base.begin_again(episodes, key),
@@ -197,7 +197,7 @@ def test_a_share_of_the_episodes_begins_within_earlier_ones(share, key):
 
 def test_other_restarts_take_the_place_of_the_first(episodes, key):
     states = base.draw_starts(episodes.starts, 4, key)
-    restarts = base.Restarts(jnp.zeros(()), jnp.zeros(4, jnp.int32))
+    restarts = base.Restarts(jnp.zeros(N), jnp.zeros(4, jnp.int32))
     for _ in range(2):
         episodes = base.with_restarts(episodes, states, restarts)
         assert episodes.starts.done.shape == (68,)

@@ -42,7 +42,7 @@ __all__ = [
 class Restarts(NamedTuple):
     """States within earlier episodes, at which some episodes begin instead of at a start."""
 
-    share: jax.Array  # [] of the episodes that begin at one
+    share: jax.Array  # [N] of the episodes that begin at one
     age: jax.Array  # [Q] int32, of each: the pool's last Q rows
 
 
