@@ -12,6 +12,7 @@ from maxent_jax.config import tasks as task_names
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import skills
 from maxent_jax.envs.base import Env
+from maxent_jax.envs.entries import Entry
 from maxent_jax.envs.task import observation_size
 from maxent_jax.envs.torso import Torso
 from maxent_jax.features import make_feature_map
@@ -84,7 +85,7 @@ def _make_around(config: Config, env: Env, num_dims: int) -> Components:
         setting = Setting(
             observation_size=len(phi.names),
             action_size=env.action_size,
-            scale=_units(config, grid, len(phi.names)),
+            scale=_units(config, entry, len(phi.names)),
             learning_rate=config.learner.learning_rate,
             num_cells=grid.num_cells,
             state_size=num_seen - size,
@@ -109,9 +110,10 @@ def with_task(components: Components, name: str) -> Components:
     return components._replace(task=task)
 
 
-def _units(config: Config, grid: Grid, num_features: int) -> jax.Array:
+def _units(config: Config, entry: Entry, num_features: int) -> jax.Array:
     """[F] the units of a bonus: an eighth of the grid's side for features in metres, else 1."""
-    sides = [1.0, 1.0]
-    if registry.environment(config.env).in_metres:
+    sides, grid = [1.0, 1.0], entry.grid
+    of_grid = entry.phi is None and grid.coordinates == (0, 1) and grid.transform is None
+    if of_grid and registry.environment(config.env).in_metres:
         sides = [(high - low) / 8 for low, high in zip(grid.low, grid.high, strict=True)]
     return jnp.asarray((sides + [1.0] * num_features)[:num_features])

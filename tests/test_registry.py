@@ -112,6 +112,45 @@ def test_what_programs_were_made_of_cannot_be_replaced(restored_tables):
     registry.register_method("replaced", "last", 0, "mixture", "last")  # of another kind
 
 
+@pytest.mark.parametrize(
+    ("name", "in_metres"),
+    [
+        *(("ant", True), ("walker2d", True), ("pendulum", False), ("brax:halfcheetah", True)),
+        *(("brax:reacher", False), ("brax:humanoidstandup", False), ("user:unknown", False)),
+        *(("playground:CartpoleBalance", False), ("user:plain", False), ("user:plane", True)),
+    ],
+)
+def test_only_positions_are_counted_in_metres(restored_tables, name, in_metres):
+    make = lambda backend, physics: Pendulum()
+    envs.register("plain", make)
+    envs.register("plane", make, in_metres=True)
+    assert registry.environment(name).in_metres == in_metres
+
+
+def test_a_bonus_has_units_of_the_grid_only_where_its_features_are_the_grids(restored_tables):
+    def units(name, grid=envs.DEFAULT_GRID, **arguments):
+        envs.register(name, lambda backend, physics: Pendulum(), grid, **arguments)
+        config = preset("smoke", env=f"user:{name}")
+        return components._units(config, envs.entry(config.env), 3).tolist()
+
+    elsewhere = envs.DEFAULT_GRID._replace(coordinates=(1, 2))
+    turned = envs.DEFAULT_GRID._replace(transform=lambda states: states)
+    assert units("metres", in_metres=True) == [2.5, 2.5, 1]  # an eighth of 20
+    assert units("angles") == [1, 1, 1]
+    assert units("own_map", phi=Position(), in_metres=True) == [1, 1, 1]
+    assert units("elsewhere", elsewhere, in_metres=True) == [1, 1, 1]
+    assert units("turned", turned, in_metres=True) == [1, 1, 1]
+
+
+class Position:
+    """A feature map of a user's."""
+
+    names = ("x", "y", "z")
+
+    def __call__(self, observation):
+        return observation[..., :3]
+
+
 def test_a_run_is_trained_and_loaded_by_one_function(tmp_path):
     config = preset("smoke", env="pendulum", num_iterations=1)
     run = maxent_jax.train(config, tmp_path / "run")

@@ -34,7 +34,7 @@ class EnvironmentRow(NamedTuple):
     physics: tuple[str, ...] = ("reference",)
     is_robot: bool = False  # an envs.task.MujocoEnv, with torques and a health test
     has_torso: bool = False  # a floating torso: it has a heading and can turn over
-    in_metres: bool = True  # the first two features are a position in metres
+    in_metres: bool = False  # the grid's coordinates are a position in metres
     time_limit: int = 1000  # the paper's, in control steps
 
 
@@ -57,11 +57,12 @@ class MethodRow(NamedTuple):
 
 
 def _robot(name: str, has_torso: bool) -> EnvironmentRow:
-    return EnvironmentRow(f"maxent_jax.envs.{name}:ENTRY", BACKENDS, PHYSICS, True, has_torso)
+    where = f"maxent_jax.envs.{name}:ENTRY"
+    return EnvironmentRow(where, BACKENDS, PHYSICS, True, has_torso, in_metres=True)
 
 
 def _classic(name: str) -> EnvironmentRow:
-    return EnvironmentRow(f"maxent_jax.envs.{name}:ENTRY", in_metres=False, time_limit=200)
+    return EnvironmentRow(f"maxent_jax.envs.{name}:ENTRY", time_limit=200)
 
 
 def _bonus(module: str, num_neighbors: int = 0, make: str = "make", **more: Any) -> BonusRow:
@@ -79,6 +80,8 @@ BRAX_ENVS = (
     *("ant", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum"),
     *("inverted_double_pendulum", "pusher", "reacher", "swimmer", "walker2d"),
 )
+# Those that leave their position in the plane out of an observation, unless they are told not to.
+BRAX_HIDES_POSITION = ("ant", "halfcheetah", "hopper", "humanoid", "swimmer", "walker2d")
 # Without the Reachers, which Playground 0.2 cannot load with MuJoCo 3.17.
 PLAYGROUND_ENVS = (
     *("AcrobotSwingup", "AcrobotSwingupSparse", "BallInCup", "CartpoleBalance"),
@@ -88,7 +91,12 @@ PLAYGROUND_ENVS = (
     *("SwimmerSwimmer6", "WalkerRun", "WalkerStand", "WalkerWalk"),
 )
 _BY_PREFIX = {
-    **{f"{BRAX}{name}": EnvironmentRow(backends=("auto", "mjx")) for name in BRAX_ENVS},
+    **{
+        f"{BRAX}{name}": EnvironmentRow(
+            backends=("auto", "mjx"), in_metres=name in BRAX_HIDES_POSITION
+        )
+        for name in BRAX_ENVS
+    },
     **{
         f"{PLAYGROUND}{name}": EnvironmentRow(backends=("auto", "mjx", "warp"))
         for name in PLAYGROUND_ENVS
@@ -243,9 +251,9 @@ def check_name(kind: str, name: Any) -> None:
         )
 
 
-def register_environment(name: str, entry: Any) -> None:
+def register_environment(name: str, entry: Any, in_metres: bool) -> None:
     """Adds an environment of a user; see envs.register, which makes the envs.Entry."""
-    ENVIRONMENTS[f"{USER}{name}"] = _USERS._replace(entry=entry)
+    ENVIRONMENTS[f"{USER}{name}"] = _USERS._replace(entry=entry, in_metres=in_metres)
 
 
 def register_bonus(name: str, row: BonusRow) -> None:

@@ -23,7 +23,7 @@ from brax.envs.base import Env
 
 from maxent_jax.checks import check_number, check_path, check_whole
 from maxent_jax.config import registry
-from maxent_jax.config.registry import MUJOCO_ENVS, resolve
+from maxent_jax.config.registry import BRAX_HIDES_POSITION, MUJOCO_ENVS, resolve
 from maxent_jax.config.validation import check_physics
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs.entries import Entry
@@ -34,7 +34,6 @@ from maxent_jax.types import Features
 
 TASKS: dict[str, Task] = {name: resolve(f"maxent_jax.envs.{name}:TASK") for name in MUJOCO_ENVS}
 DEVIATIONS = ("torque_limit", "end_flipped", "end_unhealthy")  # of MujocoEnv
-BRAX_HIDES_POSITION = ("ant", "halfcheetah", "hopper", "humanoid", "swimmer", "walker2d")
 DEFAULT_GRID = Grid(
     names=("state 0", "state 1"), low=(-10.0, -10.0), high=(10.0, 10.0), bins=(100, 100)
 )
@@ -85,6 +84,7 @@ def register(
     make: Callable[..., Env],
     grid: Grid = DEFAULT_GRID,
     phi: Features | None = None,
+    in_metres: bool = False,
 ) -> None:
     """Registers a user's environment as `user:NAME`, to be trained like any other.
 
@@ -96,6 +96,9 @@ def register(
       grid: where coverage is measured; by default the observation's first two entries, within ±10.
       phi: the feature map, [..., D] -> [..., F], with `.names`; by default the observation's first
         two entries and five random projections of the others.
+      in_metres: the grid's coordinates are a position in metres. Runs then count visited cells of
+        1 m². If the default feature map keeps these coordinates, bonuses see them in eighths of the
+        grid's sides.
     Raises:
       ConfigError: the name is already in use in this process.
       ConfigTypeError (a ValueError and a TypeError): an argument has the wrong type or form.
@@ -108,10 +111,14 @@ def register(
             phi is not None and not (callable(phi) and hasattr(phi, "names")),
             f"phi is {phi!r}, but must be a function with `names`.",
         ),
+        (
+            not isinstance(in_metres, bool),
+            f"in_metres is {in_metres!r}, but must be True or False.",
+        ),
     ):
         if wrong:
             raise ConfigTypeError(sentence)
-    registry.register_environment(name, Entry(make, grid, None, phi))
+    registry.register_environment(name, Entry(make, grid, None, phi), in_metres)
 
 
 def from_xml(

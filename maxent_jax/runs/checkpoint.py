@@ -167,7 +167,12 @@ def _less(rest: State, held: Mapping[str, Any]) -> State:
         shape = held["episodes"]["restarts"]["share"].shape
         share = jax.ShapeDtypeStruct(shape, share.dtype, sharding=share.sharding)
         episodes = episodes._replace(restarts=episodes.restarts._replace(share=share))
+    plane: Any = learner.plane
+    if plane is None and held.get("plane") is not None:  # read, and dropped by `_more`
+        where = learner.env_steps.sharding
+        plane = jax.ShapeDtypeStruct(held["plane"].shape, jnp.bool_, sharding=where)
     learner = learner._replace(
+        plane=plane,
         episodes=kept(episodes, held["episodes"]),
         replay=learner.replay._replace(
             items=kept(learner.replay.items, held["replay"]["items"]),
@@ -177,7 +182,11 @@ def _less(rest: State, held: Mapping[str, Any]) -> State:
 
 
 def _more(rest: State, shapes: State, placed: State | None) -> State:
-    """The state of which `_less` gave a part; a checkpoint without a plane begins an empty one."""
+    """The state of which `_less` gave a part.
+
+    A checkpoint without a plane begins an empty one. Where positions are not metres there is none,
+    whatever the checkpoint holds: older releases took them for metres in any environment.
+    """
     learner: Any = rest.learner
     replay = learner["replay"]
     found = {
@@ -185,7 +194,9 @@ def _more(rest: State, shapes: State, placed: State | None) -> State:
         "replay": replay._replace(items=Step(**replay.items)),
     }
     plane = shapes.learner.plane
-    if plane is not None and learner.get("plane") is None:
+    if plane is None:
+        found["plane"] = None
+    elif learner.get("plane") is None:
         say("note: an older release began this run: cells_1m counts from here on.")
         device = None if placed is None else placed.learner.plane
         found["plane"] = jnp.zeros(plane.shape, plane.dtype, device=device)
