@@ -19,6 +19,7 @@ from maxent_jax.algorithm.learner import NUM_RESTARTS
 from maxent_jax.commands import train
 from maxent_jax.config import preset
 from maxent_jax.config.registry import ENVS
+from maxent_jax.density import plane
 from maxent_jax.runs import checkpoint, driver, files, source
 from maxent_jax.runs.checkpoint import Progress
 from maxent_jax.runs.signals import Interrupted
@@ -113,6 +114,8 @@ def test_the_replay_holds_the_first_episodes():
     assert goes_on.sum() == len(begins) - begins.sum()
     assert int(first.num_steps) == len(begins)
     assert int(state.learner.visits.cells.sum() + state.learner.visits.off_grid) == len(begins)
+    unit_cells = {tuple(cell) for cell in np.floor(items.state).astype(int)}
+    assert int(plane.num_cells(state.learner.plane)) == len(unit_cells) > 1
 
 
 def test_if_no_episode_succeeds_the_newest_policy_and_all_episodes_are_used():

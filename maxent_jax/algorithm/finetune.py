@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from maxent_jax import components, mixture
 from maxent_jax.algorithm import experience, loop
-from maxent_jax.algorithm.learner import NUM_RESTARTS, Learner, of_agent, visit
+from maxent_jax.algorithm.learner import NUM_RESTARTS, Learner, of_agent, visit, visit_plane
 from maxent_jax.algorithm.loop import SEED_AXES, State
 from maxent_jax.components import Components
 from maxent_jax.config import Config, names
@@ -126,6 +126,7 @@ def _play(
         learner = learner._replace(
             history=reservoir.add(learner.history, p.phi(states), alive, key_history),
             visits=visit(p, learner.visits, states, alive),
+            plane=visit_plane(p, learner.plane, states, alive),
         )
         if fills:
             learner = learner._replace(

@@ -104,3 +104,12 @@ def visit(components: Components, visits: Visits, states: jax.Array, counts: jax
     number = counts.astype(jnp.int32)
     cells = histogram.count(states, components.grid, number)
     return Visits(visits.cells + cells, visits.off_grid + jnp.sum(number) - jnp.sum(cells))
+
+
+def visit_plane(
+    components: Components, visited: jax.Array | None, states: jax.Array, counts: jax.Array
+) -> jax.Array | None:
+    """Adds states to the visited unit cells, as `visit`; None where positions are not metres."""
+    if visited is None:
+        return None
+    return plane.visit(visited, histogram.locate(states, components.grid), counts)
