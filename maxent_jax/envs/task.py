@@ -83,7 +83,8 @@ class MujocoEnv(Env):
         self._control_center = jnp.asarray((high + low) / 2, jnp.float32)
         self._control_span = jnp.asarray((high - low) / 2 * torque_limit, jnp.float32)
         self._end_flipped = end_flipped
-        self._end_unhealthy = end_unhealthy
+        self.end_unhealthy = end_unhealthy
+        """Whether an episode ends when health fails."""
 
     @in_32_bits
     def reset(self, rng: jax.Array) -> State:
@@ -144,7 +145,7 @@ class MujocoEnv(Env):
     def _reached(self, state: State, after: PhysicsState, derived: Derived) -> State:
         observation = self.task.observe(after, derived)
         healthy = jnp.array(True)
-        if self._end_unhealthy:
+        if self.end_unhealthy:
             healthy = self.task.healthy(observation)
         if self._end_flipped:
             assert self.task.torso is not None
