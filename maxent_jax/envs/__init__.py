@@ -128,6 +128,7 @@ def from_xml(
     physics: str | Options = REFERENCE,
     reset_noise: float = 1e-2,
     healthy: Callable | None = None,
+    fast: Options = REFERENCE,
 ) -> MujocoEnv:
     """Makes an environment from an MJCF file. It observes qpos and qvel; actions are its controls.
 
@@ -139,8 +140,10 @@ def from_xml(
       reset_noise: half the range of the noise in every coordinate of a start.
       healthy: observation [..., D] -> [...] bool, false ends the episode; by default only numbers
         that are not finite end it.
+      fast: the options of the profile `fast`; by default there is no such profile.
     Raises:
-      ConfigError: MuJoCo cannot read the file, or the backend cannot simulate it.
+      ConfigError: MuJoCo cannot read the file, the backend cannot simulate it, or there is no such
+        profile.
       TypeError: an argument has the wrong type.
     """
     path = check_path("xml", xml)
@@ -156,6 +159,7 @@ def from_xml(
         observe=_qpos_and_qvel,
         healthy=healthy or _finite,
         grid=DEFAULT_GRID,
+        fast=fast,
     )
     return MujocoEnv(task, backend, physics)
 

@@ -34,7 +34,7 @@ class Task(NamedTuple):
     grid: Grid  # where coverage and histogram entropy are measured
     derived: tuple[str, ...] = ()  # fields observed in addition to the state
     torso: Torso | None = None
-    fast: Options = physics.REFERENCE  # the profile `fast`
+    fast: Options = physics.REFERENCE  # the profile `fast`; the default: it has none
 
 
 class MujocoEnv(Env):
@@ -212,7 +212,14 @@ def _options(task: Task, profile: str | Options) -> Options:
     if isinstance(profile, Options):
         return profile
     check_choice("physics", profile, PHYSICS)
-    return task.fast if profile == "fast" else physics.REFERENCE
+    if profile == "reference":
+        return physics.REFERENCE
+    if task.fast == physics.REFERENCE:
+        raise ConfigError(
+            f"physics is fast, but {task.name} has no simplified physics: choose reference, or "
+            f"pass `fast` to envs.from_xml."
+        )
+    return task.fast
 
 
 def _check(task: Task, model: mujoco.MjModel, end_flipped: bool) -> None:
