@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax.numpy as jnp
 import pytest
 
 import maxent_jax
@@ -112,6 +113,58 @@ def test_what_programs_were_made_of_cannot_be_replaced(restored_tables):
     registry.register_method("replaced", "last", 0, "mixture", "last")  # of another kind
 
 
+class Position:
+    """A feature map of a user's."""
+
+    names = ("x", "y", "z")
+
+    def __call__(self, observation):
+        return observation[..., :3]
+
+
+class Observing(Pendulum):
+    """A pendulum with an observation of another shape."""
+
+    def __init__(self, observation):
+        self._observation = observation
+
+    def reset(self, rng):
+        return super().reset(rng).replace(obs=self._observation)
+
+
+@pytest.mark.parametrize(
+    ("made", "arguments", "says"),
+    [
+        (None, {}, "user:wrong is None, but its `make` must return a brax Env."),
+        (
+            Observing(jnp.zeros(1)),
+            {},
+            r"is an array \[1\], but must be .*, D at least 2",
+        ),
+        (Observing(jnp.zeros(())), {}, r"of user:wrong is an array \[\], but must be an array"),
+        (Observing(jnp.zeros((2, 3))), {}, r"is an array \[2, 3\], but must be an array \[D\]"),
+        (Observing({"a": jnp.zeros(2)}), {}, "of user:wrong is no array, but must be an array"),
+        (
+            Pendulum(),
+            dict(grid=envs.DEFAULT_GRID._replace(coordinates=(0, 3))),
+            r"the grid of user:wrong has coordinates \(0, 3\), but there are 3",
+        ),
+        (Observing(jnp.zeros(2)), dict(phi=Position()), r"returns features \[2\], but has 3 names"),
+    ],
+)
+def test_an_environment_that_cannot_be_trained_is_refused(restored_tables, made, arguments, says):
+    for _ in range(2):  # and can be registered again
+        envs.register("wrong", lambda backend, physics: made, **arguments)
+        with pytest.raises(ConfigError, match=says):
+            components.make(preset("smoke", env="user:wrong"))
+
+
+@pytest.mark.parametrize("make", [Pendulum, lambda backend: None, lambda *, backend, physics: None])
+def test_a_function_that_does_not_take_a_backend_and_a_physics_is_refused(restored_tables, make):
+    with pytest.raises(ConfigTypeError, match="must take two arguments, the backend and the phys"):
+        envs.register("wrong", make)
+
+
 @pytest.mark.parametrize(
     ("name", "in_metres"),
     [
@@ -140,15 +193,6 @@ def test_a_bonus_has_units_of_the_grid_only_where_its_features_are_the_grids(res
     assert units("own_map", phi=Position(), in_metres=True) == [1, 1, 1]
     assert units("elsewhere", elsewhere, in_metres=True) == [1, 1, 1]
     assert units("turned", turned, in_metres=True) == [1, 1, 1]
-
-
-class Position:
-    """A feature map of a user's."""
-
-    names = ("x", "y", "z")
-
-    def __call__(self, observation):
-        return observation[..., :3]
 
 
 def test_a_run_is_trained_and_loaded_by_one_function(tmp_path):

@@ -7,6 +7,7 @@ that was added by `register`.
 
 import contextlib
 import functools
+import inspect
 import io
 import warnings
 from collections.abc import Callable
@@ -106,6 +107,10 @@ def register(
     registry.check_name("environment", name)
     for wrong, sentence in (
         (not callable(make), f"make is {make!r}, but must be a function that makes a brax Env."),
+        (
+            callable(make) and not _takes_two(make),
+            f"make is {make!r}, but must take two arguments, the backend and the physics.",
+        ),
         (not isinstance(grid, Grid), f"grid is {grid!r}, but must be a density.histogram.Grid."),
         (
             phi is not None and not (callable(phi) and hasattr(phi, "names")),
@@ -162,6 +167,17 @@ def from_xml(
         fast=fast,
     )
     return MujocoEnv(task, backend, physics)
+
+
+def _takes_two(make: Callable) -> bool:
+    """Whether a function can be called with two arguments; if nobody can know, it is trusted."""
+    try:
+        inspect.signature(make).bind("auto", "reference")
+    except TypeError:
+        return False
+    except ValueError:  # of a builtin without a signature
+        return True
+    return True
 
 
 def _qpos_and_qvel(state: PhysicsState, _) -> Any:
