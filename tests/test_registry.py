@@ -1,6 +1,7 @@
 """What a user adds from outside the package is trained and analysed like what comes with it."""
 
 import json
+import random
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 import maxent_jax
 from maxent_jax import components, envs
 from maxent_jax.commands import evaluate, train
-from maxent_jax.config import preset, registry
+from maxent_jax.config import imports, preset, registry
 from maxent_jax.envs.pendulum import Pendulum
 from maxent_jax.errors import ConfigError, ConfigTypeError, UsageError
 
@@ -22,7 +23,7 @@ SMOKE = ["--preset", "smoke", "--num-iterations", "1"]
 @pytest.fixture
 def restored_tables():
     """What a test registers is gone after it."""
-    tables = (registry.ENVIRONMENTS, registry.BONUSES, registry.METHODS, registry.imported)
+    tables = (registry.ENVIRONMENTS, registry.BONUSES, registry.METHODS, imports.imported)
     kept = [table.copy() for table in tables]
     yield
     for table, before in zip(tables, kept, strict=True):
@@ -73,6 +74,30 @@ def test_a_module_that_fails_is_named_with_its_reason(tmp_path):
     broken.write_text("1 / 0")
     with pytest.raises(UsageError, match=r"broken.py', but .*ZeroDivisionError: division"):
         evaluate.main([str(tmp_path), "--import", str(broken)])
+
+
+def test_a_file_does_not_take_the_place_of_another_module(restored_tables, tmp_path):
+    files = [tmp_path / name for name in ("random.py", "a/own.py", "b/own.py")]
+    for number, file in enumerate(files):
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(
+            "from __future__ import annotations\nimport dataclasses, sys\n"
+            "@dataclasses.dataclass\nclass Own:\n    number: int\n"  # looks its module up
+            f"made = Own({number})\nassert sys.modules[__name__].made is made\n"
+        )
+    before = dict(sys.modules)
+    imports.import_modules([str(file) for file in files])
+    assert sys.modules["random"] is random and sys.modules.get("own") is before.get("own")
+    found = [module.made.number for name, module in sys.modules.items() if name not in before]
+    assert found == [0, 1, 2] and imports.imported[-3:] == [str(file) for file in files]
+
+
+def test_a_file_that_fails_is_not_left_half_imported(tmp_path):
+    broken, before = tmp_path / "broken.py", set(sys.modules)
+    broken.write_text("1 / 0")
+    with pytest.raises(UsageError):
+        imports.import_modules([str(broken)])
+    assert set(sys.modules) == before and str(broken) not in imports.imported
 
 
 def test_a_methods_settings_are_its_own(restored_tables):

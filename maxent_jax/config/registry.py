@@ -7,14 +7,12 @@ begins with "user:". Loads no array library.
 
 import importlib
 import importlib.util
-import sys
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from maxent_jax.checks import check_choice
-from maxent_jax.errors import ConfigError, ConfigTypeError, UsageError
+from maxent_jax.errors import ConfigError, ConfigTypeError
 
 USER, BRAX, PLAYGROUND = "user:", "brax:", "playground:"
 BY_METHOD = -1  # as a refresh period: the method's own
@@ -192,8 +190,6 @@ _REGISTERED_BY = {
 
 in_use: set[tuple[str, str]] = set()
 """Kind and name of each environment and bonus that programs of this process were made of."""
-imported: list[str] = []
-"""The modules that `import_modules` imported, as the user named them."""
 
 
 def is_users(name: object) -> bool:
@@ -316,41 +312,6 @@ def resolve(where: Any) -> Any:
         return where
     module, name = where.split(":")
     return getattr(importlib.import_module(module), name)
-
-
-def import_modules(modules: Sequence[str]) -> None:
-    """Imports a user's modules, which register things, by name or by the path of a .py file.
-
-    Raises:
-      UsageError: a module does not exist, or fails.
-    """
-    for name in modules:
-        try:
-            if name.endswith(".py"):
-                _import_file(Path(name))
-            else:
-                _import_by_name(name)
-        except Exception as error:
-            raise UsageError(
-                f"import is '{name}', but it cannot be imported: {type(error).__name__}: {error}."
-            ) from error
-        if name not in imported:
-            imported.append(name)
-
-
-def _import_by_name(name: str) -> None:
-    if "" not in sys.path and str(Path.cwd()) not in sys.path:  # as with python -m
-        sys.path.insert(0, str(Path.cwd()))
-    importlib.import_module(name)
-
-
-def _import_file(path: Path) -> None:
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None or not path.is_file():
-        raise FileNotFoundError("no such file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module
-    spec.loader.exec_module(module)
 
 
 def not_registered(kind: str, name: str) -> ConfigError:
