@@ -12,8 +12,9 @@ from maxent_jax.config import tasks as task_names
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import skills
 from maxent_jax.envs.base import Env
-from maxent_jax.envs.task import observation_size
+from maxent_jax.envs.entries import Entry
 from maxent_jax.envs.torso import Torso
+from maxent_jax.errors import ConfigError, ConfigTypeError
 from maxent_jax.features import make_feature_map
 from maxent_jax.intrinsic import Bonus, Setting
 from maxent_jax.sac import agent
@@ -51,12 +52,13 @@ def make(config: Config) -> Components:
 
 @functools.lru_cache(maxsize=8)
 def _make(config: Config) -> Components:
-    registry.in_use.update({("environment", config.env), ("bonus", config.intrinsic.bonus)})
     with jax.ensure_compile_time_eval():  # the first call may come during a trace
         env = _make_env(config)
-    num_dims = observation_size(env)  # outside, where no operation of a reset is compiled
+    num_dims = _num_dims(config.env, env)  # outside, where no operation of a reset is compiled
     with jax.ensure_compile_time_eval():
-        return _make_around(config, env, num_dims)
+        found = _make_around(config, env, num_dims)
+    registry.in_use.update({("environment", config.env), ("bonus", config.intrinsic.bonus)})
+    return found
 
 
 def _make_env(config: Config) -> Env:
@@ -67,10 +69,45 @@ def _make_env(config: Config) -> Env:
     return envs.entry(config.env).make(own.backend, own.physics, **deviations)
 
 
+def _num_dims(name: str, env: Env) -> int:
+    """D of an environment, from shapes alone.
+
+    Raises:
+      ConfigError: a user's `make` returned none, or one with states that cannot be trained on.
+    """
+    if not isinstance(env, Env):
+        raise ConfigTypeError(f"{name} is {env!r}, but its `make` must return a brax Env.")
+    observation = jax.eval_shape(env.reset, jax.random.key(0)).obs
+    shape = getattr(observation, "shape", None)  # brax also knows dictionaries
+    if shape is None or len(shape) != 1 or shape[0] < 2:
+        what = "no array" if shape is None else f"an array {list(shape)}"
+        raise ConfigError(
+            f"an observation of {name} is {what}, but must be an array [D], D at least 2."
+        )
+    return shape[0]
+
+
+def _check_maps(name: str, phi: Features, grid: Grid, num_dims: int) -> None:
+    """Raises ConfigError unless a user's feature map and grid fit the states [num_dims]."""
+    state = jax.ShapeDtypeStruct((num_dims,), jnp.float32)
+    located = jax.eval_shape(grid.transform or (lambda s: s), state).shape
+    if max(grid.coordinates) >= located[-1]:
+        raise ConfigError(
+            f"the grid of {name} has coordinates {grid.coordinates}, but there are {located[-1]}."
+        )
+    found = jax.eval_shape(phi, state).shape
+    if found != (len(phi.names),):
+        raise ConfigError(
+            f"phi of {name} returns features {list(found)}, but has {len(phi.names)} names."
+        )
+
+
 def _make_around(config: Config, env: Env, num_dims: int) -> Components:
     """The components, given the environment without skills, whose states are [num_dims]."""
     entry = envs.entry(config.env)
     phi, grid = make_feature_map(config.env, num_dims), entry.grid
+    if registry.is_users(config.env):
+        _check_maps(config.env, phi, grid, num_dims)
     if size := config.environment.skill_size:
         env, phi = skills.WithSkill(env, size), skills.BareFeatures(phi, size)
         grid, num_dims = skills.bare_grid(grid, size), num_dims + size
@@ -84,7 +121,7 @@ def _make_around(config: Config, env: Env, num_dims: int) -> Components:
         setting = Setting(
             observation_size=len(phi.names),
             action_size=env.action_size,
-            scale=_units(config, grid, len(phi.names)),
+            scale=_units(config, entry, len(phi.names)),
             learning_rate=config.learner.learning_rate,
             num_cells=grid.num_cells,
             state_size=num_seen - size,
@@ -109,9 +146,10 @@ def with_task(components: Components, name: str) -> Components:
     return components._replace(task=task)
 
 
-def _units(config: Config, grid: Grid, num_features: int) -> jax.Array:
+def _units(config: Config, entry: Entry, num_features: int) -> jax.Array:
     """[F] the units of a bonus: an eighth of the grid's side for features in metres, else 1."""
-    sides = [1.0, 1.0]
-    if registry.environment(config.env).in_metres:
+    sides, grid = [1.0, 1.0], entry.grid
+    of_grid = entry.phi is None and grid.coordinates == (0, 1) and grid.transform is None
+    if of_grid and registry.environment(config.env).in_metres:
         sides = [(high - low) / 8 for low, high in zip(grid.low, grid.high, strict=True)]
     return jnp.asarray((sides + [1.0] * num_features)[:num_features])

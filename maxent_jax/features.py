@@ -40,7 +40,7 @@ class FeatureMap:
         """
         observation = jnp.asarray(observation, jnp.float32)
         size = len(self.coordinates) + len(self.projection)
-        if self.projection and observation.shape[-1:] != (size,):
+        if observation.shape[-1:] != (size,):
             raise ValueError(f"states have shape {observation.shape}, but must be [..., {size}]")
         kept = observation[..., list(self.coordinates)]
         kept = kept / jnp.broadcast_to(jnp.array(self.units), kept.shape)

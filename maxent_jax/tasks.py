@@ -120,7 +120,8 @@ _ROBOTS = {
 def _gymnasium(robot: _Robot, env: MujocoEnv) -> Reward:
     """The reward of Gymnasium's v4 tasks: forward velocity, survival, and effort.
 
-    Survival is also rewarded in the step that ends an episode. The velocity is that of the torso,
+    Survival is also rewarded in the step that ends an episode. Where health ends no episode, only
+    healthy states are rewarded for it. The velocity is that of the torso,
     in Humanoid that of the centre of mass, between two steps. In Ant and Humanoid, Gymnasium reads
     positions that MuJoCo computed within the last step of the integrator; here they are those of
     the state reached.
@@ -133,7 +134,8 @@ def _gymnasium(robot: _Robot, env: MujocoEnv) -> Reward:
     def reward(observation, action, next_observation):
         velocity = (place(next_observation) - place(observation)) / env.dt
         effort = jnp.sum(env.control(action) ** 2, axis=-1)
-        return robot.forward * velocity + robot.survival - robot.effort * effort
+        is_paid = True if env.end_unhealthy else env.task.healthy(next_observation)
+        return robot.forward * velocity + robot.survival * is_paid - robot.effort * effort
 
     return reward
 

@@ -13,6 +13,7 @@ import maxent_jax
 from maxent_jax import algorithm, envs, errors
 from maxent_jax.commands import train
 from maxent_jax.config import preset
+from maxent_jax.density import plane
 from maxent_jax.envs.pendulum import Pendulum
 from maxent_jax.runs import checkpoint, driver, files, integrity
 from maxent_jax.runs.checkpoint import Progress
@@ -117,6 +118,21 @@ def test_a_checkpoint_of_another_config_does_not_fit(tmp_path):
     checkpoint.save(tmp_path, algorithm.start(config), Progress([], None, [], {}), {})
     with pytest.raises(errors.CheckpointError, match="does not match its config"):
         checkpoint.restore_results(tmp_path, "0", preset("smoke", env="pendulum", hidden_size=16))
+
+
+@pytest.mark.parametrize("num_seeds", [1, 2])
+def test_a_plane_of_what_is_no_position_in_metres_is_dropped(tmp_path, num_seeds):
+    config = preset("smoke", env="pendulum", num_seeds=num_seeds)
+    files.write_config(tmp_path, config, {}, {})
+    state = algorithm.start(config)
+    assert state.learner.plane is None
+    visited = jnp.zeros((plane.SIDE, plane.SIDE) if num_seeds == 1 else (2, 4, 4), bool)
+    older = state._replace(learner=state.learner._replace(plane=visited))
+    checkpoint.save(tmp_path, older, Progress([], None, [], {}), {})
+    back = checkpoint.restore(tmp_path, "0", config)
+    assert back.learner.plane is None
+    pairs = zip(jax.tree.leaves(arrays(back)), jax.tree.leaves(arrays(state)), strict=True)
+    assert all(x.tobytes() == y.tobytes() for x, y in pairs)
 
 
 @pytest.mark.parametrize("schema", files.READABLE)

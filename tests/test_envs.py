@@ -14,6 +14,7 @@ from maxent_jax import envs, features
 from maxent_jax.config.registry import BACKENDS, BRAX_ENVS, PHYSICS
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs import task
+from maxent_jax.envs.physics import Options
 from maxent_jax.errors import ConfigError
 
 
@@ -151,6 +152,18 @@ def test_any_xml_can_be_an_environment(tmp_path, backend):
     after = jax.jit(env.step)(env.reset(jax.random.key(0)), jnp.array([0.5]))
     # A mass of 1 kg under 0.5 * 3 * 2 N, semi-implicit Euler: v = 3 * 0.02, x = 3 * (1 + 2) * 1e-4.
     np.testing.assert_allclose(after.obs, [9e-4, 0.06], rtol=1e-5)
+
+
+def test_an_xml_has_fast_physics_only_if_it_was_given_them(tmp_path):
+    path = cart(tmp_path)
+    with pytest.raises(ConfigError, match="physics is fast, but cart has no simplified physics"):
+        envs.from_xml(path, 2, "mujoco", "fast")
+    own = Options("implicitfast", substeps=2)
+    reference, fast = (
+        envs.from_xml(path, 2, "mujoco", name, fast=own) for name in ("reference", "fast")
+    )
+    assert (reference.model.opt.timestep, fast.model.opt.timestep) == (0.01, 0.005)
+    assert reference.dt == fast.dt == 0.02
 
 
 def test_an_xml_that_does_not_exist_or_is_none_is_refused(tmp_path):

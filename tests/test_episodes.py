@@ -4,10 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.envs.base import Env, State
+from brax.envs.base import Env, State, Wrapper
 
 from maxent_jax import envs
 from maxent_jax.envs import base
+from maxent_jax.envs.skills import WithSkill
+from maxent_jax.envs.task import MujocoEnv
 
 EDGE, POISON = 5.0, -5.0
 N, LIMIT = 3, 4
@@ -177,7 +179,7 @@ def test_a_share_of_the_episodes_begins_within_earlier_ones(share, key):
     episodes = base.init(LINE, many, 64, key)
     within = jax.vmap(LINE.reset)(jax.random.split(key, 8))
     within = within.replace(obs=within.obs + 2.0, pipeline_state=ages.astype(jnp.float32))
-    episodes = base.with_restarts(episodes, within, base.Restarts(jnp.asarray(share), ages))
+    episodes = base.with_restarts(episodes, within, base.Restarts(jnp.full(many, share), ages))
     assert base.only_starts(episodes).done.shape == (64,)
     for begun in (
         base.begin_again(episodes, key),
@@ -195,7 +197,7 @@ def test_a_share_of_the_episodes_begins_within_earlier_ones(share, key):
 
 def test_other_restarts_take_the_place_of_the_first(episodes, key):
     states = base.draw_starts(episodes.starts, 4, key)
-    restarts = base.Restarts(jnp.zeros(()), jnp.zeros(4, jnp.int32))
+    restarts = base.Restarts(jnp.zeros(N), jnp.zeros(4, jnp.int32))
     for _ in range(2):
         episodes = base.with_restarts(episodes, states, restarts)
         assert episodes.starts.done.shape == (68,)
@@ -322,3 +324,43 @@ def test_every_simulator_state_can_be_stored_and_begun_at(key):
         theirs = jax.tree.map(lambda x, i=source: x[i], episodes.env)
         assert all(jax.tree.leaves(jax.tree.map(jnp.array_equal, mine, theirs)))
     assert (begun.age == 1).all()
+
+
+class Faster(Wrapper):
+    """Moves twice as far. It knows nothing of `step_beside`."""
+
+    def step(self, state, action):
+        return self.env.step(state, 2 * action)
+
+
+class Doubled(MujocoEnv):
+    """The same by inheritance."""
+
+    def step(self, state, action):
+        return super().step(state, 2 * action)
+
+
+@pytest.mark.parametrize(
+    ("make", "has_own_step"),
+    [
+        (lambda ant: ant, False),
+        (lambda ant: WithSkill(ant, 2), False),
+        (lambda ant: Faster(ant), True),
+        (lambda ant: WithSkill(Faster(ant), 2), True),
+        (lambda ant: Faster(WithSkill(ant, 2)), True),
+        (lambda ant: Doubled(ant.task, "mujoco"), True),
+        (lambda ant: LINE, False),
+    ],
+    ids=["ant", "skill", "wrapper", "skill of wrapper", "wrapper of skill", "subclass", "line"],
+)
+def test_what_steps_beside_takes_the_steps_of_every_layer(make, has_own_step, key):
+    env = make(envs.make("ant", backend="mujoco"))
+    if has_own_step:  # and yet finds a step_beside, which leaves it out
+        assert env.step_beside
+    episodes = base.init(env, 2, 4, key)
+    action = 0.4 * jnp.ones((2, env.action_size))
+    work = lambda key: (jnp.ones(()), jnp.zeros(()))
+    expected, _ = jax.jit(lambda: base.step(env, episodes, action, 9, key))()
+    found, _, result = jax.jit(lambda: base.step_beside(env, episodes, action, 9, key, work, key))()
+    np.testing.assert_allclose(found.env.obs, expected.env.obs, rtol=1e-5, atol=1e-6)
+    assert result == 1

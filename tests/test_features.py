@@ -124,6 +124,15 @@ def test_a_classic_state_is_kept_whole_in_units_of_its_range(env_name):
     np.testing.assert_allclose(phi(s), s / np.float32(phi.units), rtol=1e-6)
 
 
+@pytest.mark.parametrize("env_name", ["ant", *CLASSIC_ENVS])
+@pytest.mark.parametrize("extra", [-1, 1])
+def test_states_of_another_size_are_refused(env_name, extra):
+    phi = make_feature_map(env_name)
+    size = len(phi.coordinates) + len(phi.projection)
+    with pytest.raises(ValueError, match=rf"but must be \[\.\.\., {size}\]"):
+        phi(np.zeros((3, size + extra), np.float32))
+
+
 def test_the_default_map_gives_unit_variance_to_unit_variance():
     phi = features._default(observation_size=60)
     s = np.random.default_rng(0).normal(size=(20_000, 60)).astype(np.float32)

@@ -20,8 +20,10 @@ from maxent_jax.commands import finetune as finetune_command
 from maxent_jax.commands import train
 from maxent_jax.config import preset
 from maxent_jax.config.registry import ENVS
+from maxent_jax.density import plane
 from maxent_jax.errors import ConfigError
-from maxent_jax.runs import driver, files, source
+from maxent_jax.runs import checkpoint, driver, files, source
+from maxent_jax.runs.checkpoint import Progress
 from maxent_jax.runs.signals import Interrupted
 from maxent_jax.sac import agent
 from maxent_jax.types import Distances, Outcomes
@@ -114,6 +116,8 @@ def test_the_replay_holds_the_first_episodes():
     assert goes_on.sum() == len(begins) - begins.sum()
     assert int(first.num_steps) == len(begins)
     assert int(state.learner.visits.cells.sum() + state.learner.visits.off_grid) == len(begins)
+    unit_cells = {tuple(cell) for cell in np.floor(items.state).astype(int)}
+    assert int(plane.num_cells(state.learner.plane)) == len(unit_cells) > 1
 
 
 def test_if_no_episode_succeeds_the_newest_policy_and_all_episodes_are_used():
@@ -144,6 +148,32 @@ def test_restarts_are_states_of_successful_episodes():
     state, _ = jax.jit(lambda s: algorithm.begin(config, s))(state)
     state, metrics = jax.jit(lambda s: algorithm.train_segment(config, s))(state)
     assert np.isfinite(metrics["critic_loss"])
+
+
+def test_the_random_baseline_does_not_restart():
+    config = task_config(start_from="both", restart_share=1.0, random_baseline=True)
+    state, _ = finetune.start(config, archive_of(config, [0.1]))
+    again = np.asarray(state.learner.episodes.start) >= config.environment.num_starts
+    n = config.budget.num_envs
+    assert again.shape == (2 * n,) and again[:n].all() and not again[n:].any()
+
+
+@pytest.mark.parametrize("num_seeds", [1, 2])
+def test_a_checkpoint_with_one_share_of_restarts_for_all_episodes_loads(tmp_path, num_seeds):
+    config = task_config(
+        start_from="both", restart_share=0.5, random_baseline=True, num_seeds=num_seeds
+    )
+    files.write_config(tmp_path, config, {}, {})
+    state = algorithm.start(config)
+    episodes = state.learner.episodes
+    of_all = jnp.full((num_seeds,) if num_seeds > 1 else (), 0.5)
+    older = episodes._replace(restarts=episodes.restarts._replace(share=of_all))
+    older = state._replace(learner=state.learner._replace(episodes=older))
+    checkpoint.save(tmp_path, older, Progress([], None, [], {}), {})
+    back = checkpoint.restore(tmp_path, "0", config).learner.episodes.restarts
+    expected = np.broadcast_to([0.5] * 4 + [0.0] * 4, episodes.restarts.share.shape)
+    np.testing.assert_array_equal(back.share, expected)
+    np.testing.assert_array_equal(back.age, episodes.restarts.age)
 
 
 def test_first_episodes_begin_at_starts_and_not_where_restarts_will_be():

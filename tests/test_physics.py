@@ -1,6 +1,9 @@
 """The physics step: the backends against each other, and what makes it a pure function."""
 
 import copy
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import gymnasium
 import jax
@@ -371,13 +374,61 @@ def test_mjx_keeps_the_deepest_contacts():
     assert mjx.make_data(device_model)._impl.contact.dist.shape == (4,)
 
 
-def test_tracing_mjx_leaves_its_colliders_as_they_were():
-    colliders = collision_driver._COLLISION_FUNC
-    before = dict(colliders)
+PLANE_AND_CAPSULE = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CAPSULE)
+
+
+@pytest.fixture
+def tangent(monkeypatch):
+    """The contact frame's second axis, for a capsule along x on the ground."""
+    its_own = jnp.tile(jnp.eye(3)[jnp.array([2, 1, 0])], (2, 1, 1))  # normal, y, x
+    contacts = lambda *_: (jnp.zeros(2), jnp.zeros((2, 3)), its_own)
+    contacts.ncon = 2
+    monkeypatch.setattr(mjx_backend, "_plane_capsule", contacts)
+    matrices = jnp.stack([jnp.eye(3), jnp.eye(3)[:, ::-1]])  # their z-axes are z and x
+    data, geoms = SimpleNamespace(geom_xmat=matrices), np.array([[0, 1]])
+    collide = collision_driver._COLLISION_FUNC[PLANE_AND_CAPSULE]
+
+    def of_contacts():
+        with jax.numpy_rank_promotion("allow"):  # as around MJX
+            return np.asarray(collide(None, data, None, geoms)[2])[:, 1].tolist()
+
+    return of_contacts
+
+
+ALIGNED, NOT_ALIGNED = [[1, 0, 0]] * 2, [[0, 1, 0]] * 2
+
+
+def test_capsules_are_aligned_only_while_our_physics_is_traced(tangent):
+    assert tangent() == NOT_ALIGNED
     with pytest.raises(RuntimeError), mjx_backend._capsule_frames():
-        assert colliders != before
+        with mjx_backend._capsule_frames():
+            assert tangent() == ALIGNED
+        assert tangent() == ALIGNED
         raise RuntimeError
-    assert colliders == before
+    assert tangent() == NOT_ALIGNED
+
+
+def test_threads_that_trace_at_the_same_time_do_not_disturb_each_other(tangent):
+    entered, left = threading.Event(), threading.Event()
+
+    def outlasts():
+        with mjx_backend._capsule_frames():
+            entered.set()
+            assert left.wait(timeout=60)
+            return tangent()
+
+    def leaves_first():
+        with mjx_backend._capsule_frames():
+            assert entered.wait(timeout=60)
+        found = tangent()
+        left.set()
+        return found
+
+    with ThreadPoolExecutor(2) as pool:
+        first = pool.submit(leaves_first)
+        second = pool.submit(outlasts)
+        assert (first.result(), second.result()) == (NOT_ALIGNED, ALIGNED)
+    assert tangent() == NOT_ALIGNED
 
 
 @pytest.fixture

@@ -86,6 +86,34 @@ def test_rewards_equal_gymnasiums_formula_at_the_states_themselves(name):
     np.testing.assert_allclose(rewards(name, observation, action, after, span), expected, atol=1e-4)
 
 
+@pytest.mark.parametrize("name", ["ant", "walker2d", "humanoid"])
+@pytest.mark.parametrize("above", [0.0, 3.0])  # metres, where no height is healthy
+def test_where_health_ends_no_episode_the_unhealthy_are_not_paid_for_it(name, above):
+    theirs = gymnasium.make(
+        IDS[name],
+        exclude_current_positions_from_observation=False,
+        terminate_when_unhealthy=False,
+    )
+    before, _ = theirs.reset(seed=0)
+    raw = theirs.unwrapped
+    qpos = raw.data.qpos.copy()
+    qpos[tasks._ROBOTS[name].height] += above
+    raw.set_state(qpos, np.zeros(raw.model.nv))
+    before[: len(qpos)] = qpos
+    action = np.zeros(raw.model.nu)
+    after, expected, terminated, *_ = theirs.step(action)
+    assert not terminated and raw.is_healthy == (above == 0)
+    found = {}
+    for ends in (True, False):
+        env = envs.make(name, backend="mujoco", end_unhealthy=ends)
+        reward = tasks.make("gymnasium", name, env).reward
+        found[ends] = float(reward(*map(jnp.float32, (before, action, after))))
+    # Gymnasium reads positions from the integrator's last evaluation, within the last step.
+    np.testing.assert_allclose(found[False], expected, atol=0.1)
+    lost = 0.0 if raw.is_healthy else tasks._ROBOTS[name].survival
+    np.testing.assert_allclose(found[True] - found[False], lost, atol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("name", "identifier"),
     [("pendulum", "Pendulum-v1"), ("mountain_car", "MountainCarContinuous-v0")],

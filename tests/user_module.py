@@ -47,6 +47,7 @@ envs.register(
     "point",
     lambda backend, physics: Point(),
     Grid(names=("x", "y"), low=(-2.0, -2.0), high=(2.0, 2.0), bins=(20, 20)),
+    in_metres=True,
 )
 intrinsic.register("far", far_from_origin)
 register_method("newest", "last", 0, "mixture", "last", reward="linear")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from maxent_jax import components, mixture
 from maxent_jax.algorithm import experience, loop
-from maxent_jax.algorithm.learner import NUM_RESTARTS, Learner, visit
+from maxent_jax.algorithm.learner import NUM_RESTARTS, Learner, of_agent, visit, visit_plane
 from maxent_jax.algorithm.loop import SEED_AXES, State
 from maxent_jax.components import Components
 from maxent_jax.config import Config, names
@@ -126,6 +126,7 @@ def _play(
         learner = learner._replace(
             history=reservoir.add(learner.history, p.phi(states), alive, key_history),
             visits=visit(p, learner.visits, states, alive),
+            plane=visit_plane(p, learner.plane, states, alive),
         )
         if fills:
             learner = learner._replace(
@@ -161,7 +162,7 @@ def _groups_side_by_side(x: jax.Array) -> jax.Array:
 
 
 def _restarting(p: Components, episodes: Episodes, found: _Episode, key: jax.Array) -> Episodes:
-    """Lets a share of the episodes begin at states of the best tenth of those that were found.
+    """Lets a share of the agent's episodes begin at states of the best tenth of those found.
 
     An episode is drawn in proportion to how far its return is above the worst. If all returns are
     equal, as when a sparse task was never solved, all episodes are alike. One that ends with its
@@ -178,7 +179,9 @@ def _restarting(p: Components, episodes: Episodes, found: _Episode, key: jax.Arr
     logits = jnp.where(found.goes_on[:, chosen], 0.0, -jnp.inf)
     time = jax.random.categorical(key_time, logits, axis=0)
     states = jax.tree.map(lambda x: x[time, chosen], found.env)
-    restarts = base.Restarts(jnp.asarray(p.config.downstream.restart_share), time + 1)
+    restarts = base.Restarts(
+        of_agent(p.config, episodes, p.config.downstream.restart_share), time + 1
+    )
     episodes = base.with_restarts(episodes, states, restarts)
     return base.begin_again(episodes, key_begin)
 

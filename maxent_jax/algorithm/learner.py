@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from maxent_jax.algorithm import experience
 from maxent_jax.algorithm.experience import Reference
 from maxent_jax.components import Components
+from maxent_jax.config import Config
 from maxent_jax.density import histogram, plane, reservoir
 from maxent_jax.density.reservoir import Reservoir
 from maxent_jax.envs import base
@@ -56,10 +57,10 @@ def init_learner(components: Components, key: jax.Array) -> Learner:
     if config.downstream.restart_share:  # until finetune puts others in their place
         restarts = jax.tree.map(lambda x: x[:NUM_RESTARTS], episodes.starts)
         no_age = jnp.zeros(restarts.done.shape, jnp.int32)
-        episodes = base.with_restarts(episodes, restarts, base.Restarts(jnp.zeros(()), no_age))
+        none_restarts = base.Restarts(of_agent(config, episodes, 0.0), no_age)
+        episodes = base.with_restarts(episodes, restarts, none_restarts)
     if config.environment.cell_restarts:
-        of_agent = (jnp.arange(num_rows) < config.budget.num_envs).astype(jnp.float32)
-        share = config.environment.cell_restarts * of_agent
+        share = of_agent(config, episodes, config.environment.cell_restarts)
         episodes = base.with_cells(episodes, components.grid.num_cells, share)
     episodic = components.bonus and components.bonus.episodic
     remembered = episodic.size if episodic else dims
@@ -85,6 +86,12 @@ def init_learner(components: Components, key: jax.Array) -> Learner:
     )
 
 
+def of_agent(config: Config, episodes: Episodes, share: float) -> jax.Array:
+    """Returns the share for the agent's episodes and 0 for the random baseline's, [N] or [2N]."""
+    num_rows = episodes.age.shape[0]
+    return share * (jnp.arange(num_rows) < config.budget.num_envs).astype(jnp.float32)
+
+
 def visit(components: Components, visits: Visits, states: jax.Array, counts: jax.Array) -> Visits:
     """Adds states to the counts.
 
@@ -97,3 +104,12 @@ def visit(components: Components, visits: Visits, states: jax.Array, counts: jax
     number = counts.astype(jnp.int32)
     cells = histogram.count(states, components.grid, number)
     return Visits(visits.cells + cells, visits.off_grid + jnp.sum(number) - jnp.sum(cells))
+
+
+def visit_plane(
+    components: Components, visited: jax.Array | None, states: jax.Array, counts: jax.Array
+) -> jax.Array | None:
+    """Adds states to the visited unit cells, as `visit`; None where positions are not metres."""
+    if visited is None:
+        return None
+    return plane.visit(visited, histogram.locate(states, components.grid), counts)

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 
 from maxent_jax.algorithm import experience, payment
 from maxent_jax.algorithm.experience import Reference
-from maxent_jax.algorithm.learner import Learner, visit
+from maxent_jax.algorithm.learner import Learner, visit, visit_plane
 from maxent_jax.algorithm.methods import Method
 from maxent_jax.components import Components
-from maxent_jax.density import histogram, plane, reservoir
+from maxent_jax.density import histogram, reservoir
 from maxent_jax.density.reservoir import Reservoir
 from maxent_jax.envs import base
 from maxent_jax.envs.base import Episodes
@@ -192,7 +192,7 @@ def _record(
             components, learner.random_visits, others.next_observation, others.valid
         ),
         env_steps=learner.env_steps + config.budget.num_envs,
-        plane=_visit_plane(components, learner, transition),
+        plane=visit_plane(components, learner.plane, transition.next_observation, transition.valid),
     )
     metrics: Metrics = {}
     if components.torso is not None:
@@ -228,15 +228,6 @@ def _refreshed(
 
 def _changes_within_iteration(method: Method) -> jax.Array:
     return method.from_history & (method.refresh_period > 0)
-
-
-def _visit_plane(
-    components: Components, learner: Learner, transition: Transition
-) -> jax.Array | None:
-    if learner.plane is None:
-        return None
-    places = histogram.locate(transition.next_observation, components.grid)
-    return plane.visit(learner.plane, places, transition.valid)
 
 
 def _draw(components: Components, learner: Learner, key: jax.Array) -> Experience:

@@ -19,7 +19,7 @@ import tyro
 
 from maxent_jax.commands import streams
 from maxent_jax.commands.streams import OutputError
-from maxent_jax.config import registry
+from maxent_jax.config import imports
 from maxent_jax.errors import ConfigError, NonFiniteError, RunError, SaveError, UsageError
 from maxent_jax.runs import runtime
 from maxent_jax.runs.signals import Interrupted
@@ -130,7 +130,7 @@ def import_modules(argv: Sequence[str], draws: bool = False) -> None:
         else:
             headless.draw_nothing()
         runtime.prepare(simulates_in_jax=flag_value(argv, "--backend") == "mjx")
-        registry.import_modules(modules)
+        imports.import_modules(modules)
 
 
 def _hiding(kind: Any, default: Any, shown: Collection[str]) -> tuple[Any, Any]:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from maxent_jax import errors
 from maxent_jax.checks import check_path
 from maxent_jax.commands import cli
-from maxent_jax.config import Config, preset, registry, tasks
+from maxent_jax.config import Config, imports, preset, tasks
 from maxent_jax.runs import files, integrity, runtime, source
 from maxent_jax.runs.claim import Claim
 from maxent_jax.runs.loggers import Sinks
@@ -294,4 +294,4 @@ def _point_onward(directory: Path) -> None:
 
 def _imports() -> list[str]:
     """The flags that import the same modules."""
-    return [word for name in registry.imported for word in ("--import", name)]
+    return [word for name in imports.imported for word in ("--import", name)]

@@ -7,14 +7,12 @@ begins with "user:". Loads no array library.
 
 import importlib
 import importlib.util
-import sys
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from maxent_jax.checks import check_choice
-from maxent_jax.errors import ConfigError, ConfigTypeError, UsageError
+from maxent_jax.errors import ConfigError, ConfigTypeError
 
 USER, BRAX, PLAYGROUND = "user:", "brax:", "playground:"
 BY_METHOD = -1  # as a refresh period: the method's own
@@ -34,7 +32,7 @@ class EnvironmentRow(NamedTuple):
     physics: tuple[str, ...] = ("reference",)
     is_robot: bool = False  # an envs.task.MujocoEnv, with torques and a health test
     has_torso: bool = False  # a floating torso: it has a heading and can turn over
-    in_metres: bool = True  # the first two features are a position in metres
+    in_metres: bool = False  # the grid's coordinates are a position in metres
     time_limit: int = 1000  # the paper's, in control steps
 
 
@@ -57,11 +55,12 @@ class MethodRow(NamedTuple):
 
 
 def _robot(name: str, has_torso: bool) -> EnvironmentRow:
-    return EnvironmentRow(f"maxent_jax.envs.{name}:ENTRY", BACKENDS, PHYSICS, True, has_torso)
+    where = f"maxent_jax.envs.{name}:ENTRY"
+    return EnvironmentRow(where, BACKENDS, PHYSICS, True, has_torso, in_metres=True)
 
 
 def _classic(name: str) -> EnvironmentRow:
-    return EnvironmentRow(f"maxent_jax.envs.{name}:ENTRY", in_metres=False, time_limit=200)
+    return EnvironmentRow(f"maxent_jax.envs.{name}:ENTRY", time_limit=200)
 
 
 def _bonus(module: str, num_neighbors: int = 0, make: str = "make", **more: Any) -> BonusRow:
@@ -79,6 +78,8 @@ BRAX_ENVS = (
     *("ant", "halfcheetah", "hopper", "humanoid", "humanoidstandup", "inverted_pendulum"),
     *("inverted_double_pendulum", "pusher", "reacher", "swimmer", "walker2d"),
 )
+# Those that leave their position in the plane out of an observation, unless they are told not to.
+BRAX_HIDES_POSITION = ("ant", "halfcheetah", "hopper", "humanoid", "swimmer", "walker2d")
 # Without the Reachers, which Playground 0.2 cannot load with MuJoCo 3.17.
 PLAYGROUND_ENVS = (
     *("AcrobotSwingup", "AcrobotSwingupSparse", "BallInCup", "CartpoleBalance"),
@@ -88,7 +89,12 @@ PLAYGROUND_ENVS = (
     *("SwimmerSwimmer6", "WalkerRun", "WalkerStand", "WalkerWalk"),
 )
 _BY_PREFIX = {
-    **{f"{BRAX}{name}": EnvironmentRow(backends=("auto", "mjx")) for name in BRAX_ENVS},
+    **{
+        f"{BRAX}{name}": EnvironmentRow(
+            backends=("auto", "mjx"), in_metres=name in BRAX_HIDES_POSITION
+        )
+        for name in BRAX_ENVS
+    },
     **{
         f"{PLAYGROUND}{name}": EnvironmentRow(backends=("auto", "mjx", "warp"))
         for name in PLAYGROUND_ENVS
@@ -184,8 +190,6 @@ _REGISTERED_BY = {
 
 in_use: set[tuple[str, str]] = set()
 """Kind and name of each environment and bonus that programs of this process were made of."""
-imported: list[str] = []
-"""The modules that `import_modules` imported, as the user named them."""
 
 
 def is_users(name: object) -> bool:
@@ -243,9 +247,9 @@ def check_name(kind: str, name: Any) -> None:
         )
 
 
-def register_environment(name: str, entry: Any) -> None:
+def register_environment(name: str, entry: Any, in_metres: bool) -> None:
     """Adds an environment of a user; see envs.register, which makes the envs.Entry."""
-    ENVIRONMENTS[f"{USER}{name}"] = _USERS._replace(entry=entry)
+    ENVIRONMENTS[f"{USER}{name}"] = _USERS._replace(entry=entry, in_metres=in_metres)
 
 
 def register_bonus(name: str, row: BonusRow) -> None:
@@ -308,41 +312,6 @@ def resolve(where: Any) -> Any:
         return where
     module, name = where.split(":")
     return getattr(importlib.import_module(module), name)
-
-
-def import_modules(modules: Sequence[str]) -> None:
-    """Imports a user's modules, which register things, by name or by the path of a .py file.
-
-    Raises:
-      UsageError: a module does not exist, or fails.
-    """
-    for name in modules:
-        try:
-            if name.endswith(".py"):
-                _import_file(Path(name))
-            else:
-                _import_by_name(name)
-        except Exception as error:
-            raise UsageError(
-                f"import is '{name}', but it cannot be imported: {type(error).__name__}: {error}."
-            ) from error
-        if name not in imported:
-            imported.append(name)
-
-
-def _import_by_name(name: str) -> None:
-    if "" not in sys.path and str(Path.cwd()) not in sys.path:  # as with python -m
-        sys.path.insert(0, str(Path.cwd()))
-    importlib.import_module(name)
-
-
-def _import_file(path: Path) -> None:
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None or not path.is_file():
-        raise FileNotFoundError("no such file")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module
-    spec.loader.exec_module(module)
 
 
 def not_registered(kind: str, name: str) -> ConfigError:

@@ -7,6 +7,7 @@ that was added by `register`.
 
 import contextlib
 import functools
+import inspect
 import io
 import warnings
 from collections.abc import Callable
@@ -23,7 +24,7 @@ from brax.envs.base import Env
 
 from maxent_jax.checks import check_number, check_path, check_whole
 from maxent_jax.config import registry
-from maxent_jax.config.registry import MUJOCO_ENVS, resolve
+from maxent_jax.config.registry import BRAX_HIDES_POSITION, MUJOCO_ENVS, resolve
 from maxent_jax.config.validation import check_physics
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs.entries import Entry
@@ -34,7 +35,6 @@ from maxent_jax.types import Features
 
 TASKS: dict[str, Task] = {name: resolve(f"maxent_jax.envs.{name}:TASK") for name in MUJOCO_ENVS}
 DEVIATIONS = ("torque_limit", "end_flipped", "end_unhealthy")  # of MujocoEnv
-BRAX_HIDES_POSITION = ("ant", "halfcheetah", "hopper", "humanoid", "swimmer", "walker2d")
 DEFAULT_GRID = Grid(
     names=("state 0", "state 1"), low=(-10.0, -10.0), high=(10.0, 10.0), bins=(100, 100)
 )
@@ -85,6 +85,7 @@ def register(
     make: Callable[..., Env],
     grid: Grid = DEFAULT_GRID,
     phi: Features | None = None,
+    in_metres: bool = False,
 ) -> None:
     """Registers a user's environment as `user:NAME`, to be trained like any other.
 
@@ -96,6 +97,9 @@ def register(
       grid: where coverage is measured; by default the observation's first two entries, within ±10.
       phi: the feature map, [..., D] -> [..., F], with `.names`; by default the observation's first
         two entries and five random projections of the others.
+      in_metres: the grid's coordinates are a position in metres. Runs then count visited cells of
+        1 m². If the default feature map keeps these coordinates, bonuses see them in eighths of the
+        grid's sides.
     Raises:
       ConfigError: the name is already in use in this process.
       ConfigTypeError (a ValueError and a TypeError): an argument has the wrong type or form.
@@ -103,15 +107,23 @@ def register(
     registry.check_name("environment", name)
     for wrong, sentence in (
         (not callable(make), f"make is {make!r}, but must be a function that makes a brax Env."),
+        (
+            callable(make) and not _takes_two(make),
+            f"make is {make!r}, but must take two arguments, the backend and the physics.",
+        ),
         (not isinstance(grid, Grid), f"grid is {grid!r}, but must be a density.histogram.Grid."),
         (
             phi is not None and not (callable(phi) and hasattr(phi, "names")),
             f"phi is {phi!r}, but must be a function with `names`.",
         ),
+        (
+            not isinstance(in_metres, bool),
+            f"in_metres is {in_metres!r}, but must be True or False.",
+        ),
     ):
         if wrong:
             raise ConfigTypeError(sentence)
-    registry.register_environment(name, Entry(make, grid, None, phi))
+    registry.register_environment(name, Entry(make, grid, None, phi), in_metres)
 
 
 def from_xml(
@@ -121,6 +133,7 @@ def from_xml(
     physics: str | Options = REFERENCE,
     reset_noise: float = 1e-2,
     healthy: Callable | None = None,
+    fast: Options = REFERENCE,
 ) -> MujocoEnv:
     """Makes an environment from an MJCF file. It observes qpos and qvel; actions are its controls.
 
@@ -132,8 +145,10 @@ def from_xml(
       reset_noise: half the range of the noise in every coordinate of a start.
       healthy: observation [..., D] -> [...] bool, false ends the episode; by default only numbers
         that are not finite end it.
+      fast: the options of the profile `fast`; by default there is no such profile.
     Raises:
-      ConfigError: MuJoCo cannot read the file, or the backend cannot simulate it.
+      ConfigError: MuJoCo cannot read the file, the backend cannot simulate it, or there is no such
+        profile.
       TypeError: an argument has the wrong type.
     """
     path = check_path("xml", xml)
@@ -149,8 +164,20 @@ def from_xml(
         observe=_qpos_and_qvel,
         healthy=healthy or _finite,
         grid=DEFAULT_GRID,
+        fast=fast,
     )
     return MujocoEnv(task, backend, physics)
+
+
+def _takes_two(make: Callable) -> bool:
+    """Whether a function can be called with two arguments; if nobody can know, it is trusted."""
+    try:
+        inspect.signature(make).bind("auto", "reference")
+    except TypeError:
+        return False
+    except ValueError:  # of a builtin without a signature
+        return True
+    return True
 
 
 def _qpos_and_qvel(state: PhysicsState, _) -> Any:

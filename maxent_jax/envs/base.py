@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env, State
+from brax.envs.base import Env, State, Wrapper
 
 from maxent_jax.envs import cells
 from maxent_jax.envs.cells import Cells
@@ -42,7 +42,7 @@ __all__ = [
 class Restarts(NamedTuple):
     """States within earlier episodes, at which some episodes begin instead of at a start."""
 
-    share: jax.Array  # [] of the episodes that begin at one
+    share: jax.Array  # [N] of the episodes that begin at one
     age: jax.Array  # [Q] int32, of each: the pool's last Q rows
 
 
@@ -119,11 +119,29 @@ def step_beside(
     Returns:
       The episodes after the step, the transitions [N, ...], and the result of `work`.
     """
-    if isinstance(env.unwrapped, MujocoEnv):
+    if _steps_beside(env):
         after, result = env.step_beside(episodes.env, action, work, key_work)
     else:
         after, (result, _) = jax.vmap(env.step)(episodes.env, action), work(key_work)
     return *_goes_on(episodes, after, action, episode_length, key), result
+
+
+def _steps_beside(env: Env) -> bool:
+    """Whether the environment's `step_beside` does what `step` does, in each of its layers.
+
+    A brax Wrapper passes on what it lacks: one that changes `step` alone would be left out.
+    """
+    while isinstance(env, Wrapper) and _has_both(env):
+        env = env.env
+    return isinstance(env, MujocoEnv) and _has_both(env)
+
+
+def _has_both(env: Env) -> bool:
+    """Whether the class that defines `step` defines `step_beside` too, or a subclass of it does."""
+    nearest = next(
+        kind for kind in type(env).__mro__ if {"step", "step_beside"} & vars(kind).keys()
+    )
+    return "step_beside" in vars(nearest)
 
 
 def _goes_on(

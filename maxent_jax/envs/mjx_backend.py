@@ -1,6 +1,7 @@
 """Physics on the device: MuJoCo MJX, in jax or in Warp."""
 
 import contextlib
+import contextvars
 import copy
 import importlib
 import importlib.util
@@ -128,6 +129,14 @@ def _fields(data: mjx.Data, names: tuple[str, ...]) -> Derived:
     return {n: jnp.ravel(getattr(data if n in public else data._impl, n)) for n in names}
 
 
+# MJX has one table of colliders in a process, and programs are traced in several threads. Its entry
+# is therefore replaced once, when this module is imported, and each context chooses for itself.
+_COLLIDERS = collision_driver._COLLISION_FUNC
+_PAIR = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CAPSULE)
+_plane_capsule = _COLLIDERS[_PAIR]  # MJX's own
+_aligns = contextvars.ContextVar("aligns", default=False)
+
+
 @contextlib.contextmanager
 def _capsule_frames() -> Iterator[None]:
     """Aligns the friction of a capsule on a plane with the capsule, as in C, while MJX is traced.
@@ -136,22 +145,25 @@ def _capsule_frames() -> Iterator[None]:
     turns the friction pyramid: the velocity after one Ant step in ten is 1 to 20 % off, and turning
     the world is no longer a symmetry. See google-deepmind/mujoco, issue 2774.
     """
-    colliders = collision_driver._COLLISION_FUNC
-    pair = (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CAPSULE)
-    original = colliders[pair]
-
-    def aligned(model, data, key, geoms):
-        distance, position, _ = original(model, data, key, geoms)
-        normal, axis = (data.geom_xmat[geom][..., 2] for geom in geoms.T)
-        along = axis - normal * jnp.sum(normal * axis, -1, keepdims=True)
-        length = jnp.linalg.norm(along, axis=-1, keepdims=True)
-        along = jnp.where(length > 0, along / length, jnp.array([1.0, 0.0, 0.0]))
-        frame = jnp.stack([normal, along, jnp.cross(normal, along)], axis=1)
-        return distance, position, jnp.repeat(frame, original.ncon, axis=0)
-
-    aligned.ncon = original.ncon  # type: ignore[attr-defined]
-    colliders[pair] = aligned
+    before = _aligns.set(True)
     try:
         yield
     finally:
-        colliders[pair] = original
+        _aligns.reset(before)
+
+
+def _plane_on_capsule(model, data, key, geoms):
+    """MJX's contacts of planes with capsules; within `_capsule_frames`, with aligned frames."""
+    distance, position, frame = _plane_capsule(model, data, key, geoms)
+    if not _aligns.get():
+        return distance, position, frame
+    normal, axis = (data.geom_xmat[geom][..., 2] for geom in geoms.T)
+    along = axis - normal * jnp.sum(normal * axis, -1, keepdims=True)
+    length = jnp.linalg.norm(along, axis=-1, keepdims=True)
+    along = jnp.where(length > 0, along / length, jnp.array([1.0, 0.0, 0.0]))
+    frame = jnp.stack([normal, along, jnp.cross(normal, along)], axis=1)
+    return distance, position, jnp.repeat(frame, _plane_capsule.ncon, axis=0)
+
+
+_plane_on_capsule.ncon = _plane_capsule.ncon  # type: ignore[attr-defined]
+_COLLIDERS[_PAIR] = _plane_on_capsule

@@ -34,7 +34,7 @@ class Task(NamedTuple):
     grid: Grid  # where coverage and histogram entropy are measured
     derived: tuple[str, ...] = ()  # fields observed in addition to the state
     torso: Torso | None = None
-    fast: Options = physics.REFERENCE  # the profile `fast`
+    fast: Options = physics.REFERENCE  # the profile `fast`; the default: it has none
 
 
 class MujocoEnv(Env):
@@ -83,7 +83,8 @@ class MujocoEnv(Env):
         self._control_center = jnp.asarray((high + low) / 2, jnp.float32)
         self._control_span = jnp.asarray((high - low) / 2 * torque_limit, jnp.float32)
         self._end_flipped = end_flipped
-        self._end_unhealthy = end_unhealthy
+        self.end_unhealthy = end_unhealthy
+        """Whether an episode ends when health fails."""
 
     @in_32_bits
     def reset(self, rng: jax.Array) -> State:
@@ -144,7 +145,7 @@ class MujocoEnv(Env):
     def _reached(self, state: State, after: PhysicsState, derived: Derived) -> State:
         observation = self.task.observe(after, derived)
         healthy = jnp.array(True)
-        if self._end_unhealthy:
+        if self.end_unhealthy:
             healthy = self.task.healthy(observation)
         if self._end_flipped:
             assert self.task.torso is not None
@@ -211,7 +212,14 @@ def _options(task: Task, profile: str | Options) -> Options:
     if isinstance(profile, Options):
         return profile
     check_choice("physics", profile, PHYSICS)
-    return task.fast if profile == "fast" else physics.REFERENCE
+    if profile == "reference":
+        return physics.REFERENCE
+    if task.fast == physics.REFERENCE:
+        raise ConfigError(
+            f"physics is fast, but {task.name} has no simplified physics: choose reference, or "
+            f"pass `fast` to envs.from_xml."
+        )
+    return task.fast
 
 
 def _check(task: Task, model: mujoco.MjModel, end_flipped: bool) -> None:

@@ -27,7 +27,7 @@ from maxent_jax.algorithm import State
 from maxent_jax.algorithm.experience import Step
 from maxent_jax.algorithm.learner import Learner, Visits
 from maxent_jax.config import Config
-from maxent_jax.envs.base import Episodes
+from maxent_jax.envs.base import Episodes, Restarts
 from maxent_jax.errors import CheckpointError, SaveError
 from maxent_jax.mixture import Archive
 from maxent_jax.runs import files, integrity
@@ -155,14 +155,25 @@ def _held(run_directory: Path, name: str) -> Mapping[str, Any]:
 
 
 def _less(rest: State, held: Mapping[str, Any]) -> State:
-    """Without the fields that the checkpoint lacks: Orbax insists on the presence of all."""
+    """What the checkpoint holds of the state: Orbax insists on the presence and shape of all."""
 
     def kept(fields: Any, those: Mapping[str, Any]) -> Any:
         return {name: x for name, x in fields._asdict().items() if name in those}
 
     learner = rest.learner
+    episodes = learner.episodes
+    if isinstance(episodes.restarts, Restarts):
+        share: Any = episodes.restarts.share
+        shape = held["episodes"]["restarts"]["share"].shape
+        share = jax.ShapeDtypeStruct(shape, share.dtype, sharding=share.sharding)
+        episodes = episodes._replace(restarts=episodes.restarts._replace(share=share))
+    plane: Any = learner.plane
+    if plane is None and held.get("plane") is not None:  # read, and dropped by `_more`
+        where = learner.env_steps.sharding
+        plane = jax.ShapeDtypeStruct(held["plane"].shape, jnp.bool_, sharding=where)
     learner = learner._replace(
-        episodes=kept(learner.episodes, held["episodes"]),
+        plane=plane,
+        episodes=kept(episodes, held["episodes"]),
         replay=learner.replay._replace(
             items=kept(learner.replay.items, held["replay"]["items"]),
         ),
@@ -171,19 +182,42 @@ def _less(rest: State, held: Mapping[str, Any]) -> State:
 
 
 def _more(rest: State, shapes: State, placed: State | None) -> State:
-    """The state of which `_less` gave a part; a checkpoint without a plane begins an empty one."""
+    """The state of which `_less` gave a part.
+
+    A checkpoint without a plane begins an empty one. Where positions are not metres there is none,
+    whatever the checkpoint holds: older releases took them for metres in any environment.
+    """
     learner: Any = rest.learner
     replay = learner["replay"]
     found = {
-        "episodes": Episodes(**learner["episodes"]),
+        "episodes": _with_share_of_each(Episodes(**learner["episodes"]), shapes, placed),
         "replay": replay._replace(items=Step(**replay.items)),
     }
     plane = shapes.learner.plane
-    if plane is not None and learner.get("plane") is None:
+    if plane is None:
+        found["plane"] = None
+    elif learner.get("plane") is None:
         say("note: an older release began this run: cells_1m counts from here on.")
         device = None if placed is None else placed.learner.plane
         found["plane"] = jnp.zeros(plane.shape, plane.dtype, device=device)
     return rest._replace(learner=Learner(**{**learner, **found}))
+
+
+def _with_share_of_each(episodes: Episodes, shapes: State, placed: State | None) -> Episodes:
+    """Episodes with a share of restarts for each; older checkpoints hold one for all of them."""
+    restarts: Any = episodes.restarts
+    wanted: Any = shapes.learner.episodes.restarts
+    if not isinstance(restarts, Restarts) or restarts.share.shape == wanted.share.shape:
+        return episodes
+    num_envs, shape = shapes.learner.place.shape[-1], wanted.share.shape
+
+    def of_each(of_all: jax.Array) -> jax.Array:
+        of_agent = jnp.broadcast_to(jnp.arange(shape[-1]) < num_envs, shape)
+        return jnp.where(of_agent, jnp.broadcast_to(of_all[..., None], shape), 0.0)
+
+    where: Any = None if placed is None else placed.learner.episodes.restarts
+    made = jax.jit(of_each, out_shardings=where and where.share)(restarts.share)
+    return episodes._replace(restarts=restarts._replace(share=made))
 
 
 def _write_progress(folder: Path, progress: Progress, machine: dict[str, Any]) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from maxent_jax.config import DEFAULTS, Config, from_flat, registry
+from maxent_jax.config import DEFAULTS, Config, from_flat, imports
 from maxent_jax.errors import ConfigError, RunError, SaveError
 
 SCHEMA = 7  # of the directory, including its checkpoints
@@ -50,7 +50,7 @@ def write_config(
         "id": uuid.uuid4().hex[:12],
         "config": dataclasses.asdict(config),
         "method": method,
-        "imported": registry.imported,
+        "imported": imports.imported,
         "deviations_from_the_paper": departures,
         "budget": {
             "env_steps": config.budget.steps_per_iteration * config.budget.num_iterations,

@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 
 from maxent_jax.analysis import load_run
-from maxent_jax.config import registry
+from maxent_jax.config import imports
 from maxent_jax.visual import plotting
 
 EPISODES = 5  # of each policy
@@ -30,7 +30,7 @@ def draw_missing(directory: Path) -> None:
         _draw(directory)
         return
     alone = multiprocessing.get_context("spawn").Process(
-        target=_draw, args=(directory, registry.imported)
+        target=_draw, args=(directory, imports.imported)
     )
     os.environ["JAX_PLATFORMS"] = "cpu"  # for the child: the accelerator's memory is in use
     alone.start()
@@ -40,7 +40,7 @@ def draw_missing(directory: Path) -> None:
 
 
 def _draw(directory: Path, modules: Sequence[str] = ()) -> None:
-    registry.import_modules(modules)
+    imports.import_modules(modules)
     run = load_run(directory)
     with_skills = run.config.environment.skill_size > 0
     episodes = EPISODES_WITH_SKILLS if with_skills else EPISODES
