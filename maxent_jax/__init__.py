@@ -4,23 +4,30 @@ Importing the package loads no array library, so a command line can reject bad i
 `load_run`, `train` and the modules load it when they are used.
 """
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from maxent_jax.analysis import Run, load_run
     from maxent_jax.commands.train import train
+    from maxent_jax.config import Config, preset
 
 __version__ = "0.1.0"
-__all__ = ["Run", "load_run", "train"]
+__all__ = ["Config", "Run", "load_run", "preset", "train"]
+_MODULES = {
+    "Config": "config",
+    "Run": "analysis",
+    "load_run": "analysis",
+    "preset": "config",
+    "train": "commands.train",
+}
 
 
 def __getattr__(name: str) -> Any:
-    if name == "train":
-        from maxent_jax.commands.train import train
-
-        return train
-    if name in __all__:
-        from maxent_jax import analysis
-
-        return getattr(analysis, name)
+    if name in _MODULES:
+        return getattr(importlib.import_module(f"maxent_jax.{_MODULES[name]}"), name)
     raise AttributeError(f"module 'maxent_jax' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
