@@ -119,7 +119,7 @@ def _make_around(config: Config, env: Env, num_dims: int) -> Components:
     bonus = None
     if config.intrinsic.bonus != "none":
         setting = Setting(
-            observation_size=len(phi.names),
+            num_features=len(phi.names),
             action_size=env.action_size,
             scale=_units(config, entry, len(phi.names)),
             learning_rate=config.learner.learning_rate,

@@ -35,7 +35,7 @@ KEY = jax.random.key(7)
 
 
 def setting(size=D, scale=SCALE):
-    return Setting(size, A, jnp.asarray(scale), RATE, CELLS)
+    return Setting(size, A, jnp.asarray(scale), RATE, CELLS, state_size=size)
 
 
 def steps_of(seed=0, size=B, spread=1.0):
@@ -141,7 +141,7 @@ class TestEveryBonus:
             assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(others))
         if bonus.episodic is None:
             return
-        embedding = jax.eval_shape(bonus.episodic.embed, state, batch.observation)
+        embedding = jax.eval_shape(bonus.episodic.embed, state, batch.features)
         assert embedding.shape == (B, bonus.episodic.size)
         earlier = jnp.zeros((B, 9, bonus.episodic.size))
         count = jnp.zeros(B, jnp.int32)
@@ -230,7 +230,7 @@ def test_rnd_pays_the_error_over_its_running_deviation():
     batches[1].next_observation[0, 0] = 1e4  # is clipped
     met, errors = np.zeros((0, D)), []
     for batch in batches:
-        after = np.float64(batch.next_observation) / SCALE
+        after = np.float64(batch.next_features) / SCALE
         met = np.concatenate([met, after])
         errors.append(rnd_error(state, met, after))
         state, reward, metrics = step(state, batch, KEY)
@@ -268,7 +268,7 @@ def test_rnd_pays_less_where_it_has_learned_and_as_much_elsewhere():
 def icm_errors(parameters, batch):
     before, after = (
         trunk(parameters.trunk, np.float64(x) / SCALE)
-        for x in (batch.observation, batch.next_observation)
+        for x in (batch.features, batch.next_features)
     )
     action = np.float64(batch.action)
     forward = mlp(parameters.forward, np.concatenate([before, action], -1)) - after
@@ -313,7 +313,7 @@ def test_icm_finds_the_action_and_is_surprised_by_what_it_has_not_seen():
     # Measured over three seeds: at most 0.19 of the error of guessing 0; 12 times the reward.
     assert inverse.mean() < 0.3 * np.linalg.norm(fresh.action, axis=-1).mean()
     usual = step(state, fresh, KEY)[1]
-    astray = fresh._replace(next_observation=-fresh.next_observation)
+    astray = fresh._replace(next_features=-fresh.next_features)
     assert step(state, astray, KEY)[1].mean() > 5 * usual.mean()
 
 
@@ -331,7 +331,7 @@ def test_apt_pays_the_logarithm_of_the_mean_distance_in_running_means():
     state, met = init(KEY), []
     for seed in (1, 2):
         batch = steps_of(seed)
-        embedding = trunk(state.icm.parameters.trunk, np.float64(batch.next_observation) / SCALE)
+        embedding = trunk(state.icm.parameters.trunk, np.float64(batch.next_features) / SCALE)
         distance = nearest(embedding, 12)
         met.append(distance)
         expected = np.log1p(np.maximum(distance / np.mean(met) - 1e-4, 0).mean(-1))
@@ -411,18 +411,16 @@ def test_ngu_multiplies_what_was_stored_by_a_modulator_between_1_and_5():
     batch = steps_of()
     episodic = np.linspace(0, 30, B, dtype=np.float32)
     batch = batch._replace(episodic=episodic)
-    after = np.float64(batch.next_observation) / SCALE
+    after = np.float64(batch.next_features) / SCALE
     error = rnd_error(state.rnd, after, after)
     modulator = np.clip(1 + (error - error.mean()) / error.std(), 1, 5)
     assert 1.5 < modulator.max() < 5
     assert (modulator == 1).sum() > 5
     np.testing.assert_allclose(step(state, batch, KEY)[1], episodic * modulator, **CLOSE)
     # One state far off, of 24: (23 × 24)^½ / 24^½ = 4.8 deviations above the mean, nearly.
-    lone = np.repeat(batch.next_observation[:1], B, axis=0)
+    lone = np.repeat(batch.next_features[:1], B, axis=0)
     lone[0] *= -1
-    found = step(
-        state, batch._replace(next_observation=lone, episodic=np.ones_like(episodic)), KEY
-    )[1]
+    found = step(state, batch._replace(next_features=lone, episodic=np.ones_like(episodic)), KEY)[1]
     np.testing.assert_allclose(found[1:], 1, rtol=1e-6)
     assert float(found[0]) == 5
 
@@ -431,8 +429,8 @@ def test_the_embedding_of_ngu_is_its_network_and_keeps_to_what_actions_move():
     state, embed, _, _ = ngu_parts()
     batch = steps_of()
     network = state.controllable.parameters.embedding
-    expected = mlp(network, np.float64(batch.observation) / SCALE)
-    np.testing.assert_allclose(embed(state, batch.observation), expected, **CLOSE)
+    expected = mlp(network, np.float64(batch.features) / SCALE)
+    np.testing.assert_allclose(embed(state, batch.features), expected, **CLOSE)
 
     learned = after_moves("ngu", 400)
     fresh = moves(1000)
@@ -441,8 +439,8 @@ def test_the_embedding_of_ngu_is_its_network_and_keeps_to_what_actions_move():
     assert metrics["bonus_inverse_error"] < 0.1 / 3
 
     def sensitivity(state, axis):
-        moved = batch.observation + 0.3 * SCALE * np.eye(D, dtype=np.float32)[axis]
-        change = np.asarray(embed(state, moved)) - np.asarray(embed(state, batch.observation))
+        moved = batch.features + 0.3 * SCALE * np.eye(D, dtype=np.float32)[axis]
+        change = np.asarray(embed(state, moved)) - np.asarray(embed(state, batch.features))
         return np.linalg.norm(change, axis=-1).mean()
 
     contrast = lambda state: sensitivity(state, 0) / sensitivity(state, 2)
@@ -455,7 +453,7 @@ def test_the_embedding_of_ngu_is_its_network_and_keeps_to_what_actions_move():
 def test_re3_pays_the_third_nearest_in_a_space_that_stays():
     _, init, step = made("re3")
     state, batch = init(KEY), steps_of()
-    embedding = mlp(state, np.float64(batch.next_observation) / SCALE)
+    embedding = mlp(state, np.float64(batch.next_features) / SCALE)
     after, reward, _ = step(state, batch, KEY)
     np.testing.assert_allclose(reward, np.log(1 + nearest(embedding, 3)[:, -1]), **CLOSE)
     jax.tree.map(np.testing.assert_array_equal, after, state)
@@ -552,7 +550,7 @@ def test_vcse_pays_what_the_estimator_says_of_normalised_values():
     batch = steps_of()
     value = np.float64(batch.value)
     values = (value - value.mean()) / np.sqrt(value.var() + 1e-5)
-    states = np.float64(batch.next_observation) / SCALE / D
+    states = np.float64(batch.next_features) / SCALE / D
     distance, count = kraskov(states, values, 12)
     expected = digamma(count + 1.0) / D + np.log(2 * distance + 1e-5)
     np.testing.assert_allclose(step(init(KEY), batch, KEY)[1], expected, rtol=1e-5, atol=1e-6)
@@ -561,7 +559,7 @@ def test_vcse_pays_what_the_estimator_says_of_normalised_values():
 def test_without_a_difference_in_value_vcse_is_the_entropy_of_states():
     _, init, step = made("vcse")
     batch = steps_of()._replace(value=np.full(B, 3, np.float32))
-    radius = nearest(np.float64(batch.next_observation) / SCALE / D, 12)[:, -1]
+    radius = nearest(np.float64(batch.next_features) / SCALE / D, 12)[:, -1]
     expected = digamma(B) / D + np.log(2 * radius + 1e-5)
     np.testing.assert_allclose(step(init(KEY), batch, KEY)[1], expected, rtol=1e-5, atol=1e-6)
 
@@ -623,7 +621,7 @@ def test_kmeans_pays_from_where_the_centres_are_and_then_follows_each_state_in_t
     state = init(KEY)
     for seed in (1, 2):
         batch, key = steps_of(seed), jax.random.key(seed)
-        scaled = batch.next_observation / SCALE
+        scaled = batch.next_features / SCALE
         expected = []
         for one in scaled:
             moved = follow(state.centers, state.counts, [one])[0]
@@ -733,9 +731,9 @@ def balanced(scores):
 def proto_loss(state, parameters, batch):
     """In float64: cross entropy between the assignment of s' and the prediction from s."""
     prototypes = np.float64(state.online.parameters.prototypes)
-    reached = proto_embedding(state.target, batch.next_observation)
+    reached = proto_embedding(state.target, batch.next_features)
     assigned = balanced(reached @ prototypes.T / 0.1)
-    embedding = mlp(parameters.network, np.float64(batch.observation) / SCALE)
+    embedding = mlp(parameters.network, np.float64(batch.features) / SCALE)
     scores = unit(mlp(parameters.projector, embedding)) @ np.float64(parameters.prototypes).T
     return -(assigned * log_softmax(scores / 0.1, axis=-1)).sum(-1).mean()
 
@@ -767,7 +765,7 @@ def test_proto_pays_the_third_nearest_candidate_and_its_queue_forgets_the_oldest
     state = init(KEY)
     for seed in range(1, 6):
         batch, before = steps_of(seed), state
-        embedding = proto_embedding(state.online.parameters.network, batch.next_observation)
+        embedding = proto_embedding(state.online.parameters.network, batch.next_features)
         state, reward, metrics = step(state, batch, KEY)
         new, kept = np.split(np.asarray(state.queue), [512])
         np.testing.assert_array_equal(kept, before.queue[:-512])
@@ -795,7 +793,7 @@ def test_proto_pays_the_farthest_of_fewer_than_three_candidates_and_0_without_an
     bonus, init, _ = made("proto")
     state = init(KEY)
     batch = jax.tree.map(lambda x: np.repeat(x[:1], B, axis=0), steps_of())  # one transition
-    here = proto_embedding(state.online.parameters.network, batch.next_observation)[0]
+    here = proto_embedding(state.online.parameters.network, batch.next_features)[0]
     queue = np.tile(np.float32(here), (proto.QUEUE_SIZE, 1))  # what is not filled lies at 0
     queue[:filled, 0] += (0.5, 1.0, 0.25, 0.75)[:filled]
     state = state._replace(queue=queue, filled=jnp.int32(filled))
@@ -833,7 +831,7 @@ def test_a_state_without_length_still_has_a_gradient():
 
 def giril_losses(parameters, batch, noise):
     """In float64: reconstruction, action, divergence."""
-    before, after = (np.float64(x) / SCALE for x in (batch.observation, batch.next_observation))
+    before, after = (np.float64(x) / SCALE for x in (batch.features, batch.next_features))
     encoded = mlp(parameters.encoder, np.concatenate([before, after], -1))
     mean, log_std = encoded[:, :A], np.clip(encoded[:, A:], -5, 2)
     code = mean + np.exp(log_std) * noise
@@ -847,7 +845,7 @@ def test_giril_pays_the_squared_error_given_the_action_and_reports_its_losses():
     state = init(KEY)
     for seed in (1, 2):
         batch, key = steps_of(seed), jax.random.key(seed)
-        before, after = (np.float64(x) / SCALE for x in (batch.observation, batch.next_observation))
+        before, after = (np.float64(x) / SCALE for x in (batch.features, batch.next_features))
         cause = np.concatenate([before, np.float64(batch.action)], -1)
         squared = ((mlp(state.parameters.decoder, cause) - after) ** 2).sum(-1)
         losses = giril_losses(state.parameters, batch, np.float64(jax.random.normal(key, (B, A))))
@@ -877,7 +875,7 @@ def test_giril_finds_the_action_and_is_surprised_by_what_it_has_not_seen():
     usual, metrics = step(state, fresh, KEY)[1:]
     # Measured over three seeds: at most 0.027, where guessing 0 gives 1 / 3; 10 times the reward.
     assert metrics["bonus_action_error"] < 0.2 / 3
-    astray = fresh._replace(next_observation=-fresh.next_observation)
+    astray = fresh._replace(next_features=-fresh.next_features)
     assert step(state, astray, KEY)[1].mean() > 5 * usual.mean()
 
 

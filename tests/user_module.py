@@ -39,7 +39,7 @@ def far_from_origin(setting):
     del setting
     return intrinsic.Bonus(
         init=lambda key: jnp.zeros(()),
-        reward=lambda state, steps: (state, jnp.sum(steps.next_observation**2, axis=-1)),
+        reward=lambda state, steps: (state, jnp.sum(steps.next_features**2, axis=-1)),
     )
 
 

@@ -124,21 +124,23 @@ def pay_bonus(
     components: Components, learner: Learner, drawn: Experience, key: jax.Array
 ) -> tuple[Any, jax.Array, Metrics]:
     """Returns the bonus after learning from the draw, its reward [updates, B, 1], and metrics."""
-    # It sees features, as every other reward does; with skills also states. Unless it has a scale,
-    # its reward is divided by the standard deviation over the draw: SAC's temperature needs one.
+    # Unless it has a scale, its reward is divided by the standard deviation over the draw: SAC's
+    # temperature needs one.
     payer = components.bonus
     assert payer is not None
     key_value, key_learn = jax.random.split(key)
     parameters, outcomes = learner.agent.parameters, drawn.outcomes
     steps = Steps(
-        observation=outcomes.features[..., 0, :],
+        features=outcomes.features[..., 0, :],
         action=drawn.action,
-        next_observation=outcomes.next_features[..., 0, :],
+        next_features=outcomes.next_features[..., 0, :],
+        state=_without_skill(components, drawn.observation),
+        next_state=_without_skill(components, drawn.next_observation),
         value=sac_agent.value(components.sac, parameters, drawn.next_observation, key_value),
         episodic=outcomes.bonus[..., 0],
         row=drawn.row,
         cell=_cells(components, drawn.next_observation),
-        **_states(components, drawn),
+        skill=_skill(components, drawn.observation),
     )
     together = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps)
     bonus, found = payer.reward(learner.bonus, together)
@@ -168,16 +170,14 @@ def _for_living(components: Components, outcomes: Outcomes) -> jax.Array:
     return components.config.intrinsic.alive_bonus * (1.0 - outcomes.terminated)
 
 
-def _states(components: Components, drawn: Experience) -> dict[str, jax.Array]:
-    """Before and after the step, what the networks see; and the skill, apart."""
+def _without_skill(components: Components, states: jax.Array) -> jax.Array:
     size = components.config.environment.skill_size
-    if not size:
-        return {}
-    return {
-        "state": without_skill(drawn.observation, size),
-        "next_state": without_skill(drawn.next_observation, size),
-        "skill": drawn.observation[..., -size:],
-    }
+    return without_skill(states, size) if size else states
+
+
+def _skill(components: Components, states: jax.Array) -> jax.Array | None:
+    size = components.config.environment.skill_size
+    return states[..., -size:] if size else None
 
 
 def _cells(components: Components, states: jax.Array) -> jax.Array:

@@ -34,10 +34,10 @@ def make(name: str, setting: Setting) -> Bonus:
       name: a row of config.registry.BONUSES.
       setting: the sizes and units of the run.
     Raises:
-      ValueError: the name is unknown, or the scale is not [D].
+      ValueError: the name is unknown, or the scale is not [F].
     """
     row = registry.bonus(name)
-    size = setting.observation_size
+    size = setting.num_features
     if setting.scale.shape != (size,):
         raise ValueError(f"scale has shape {setting.scale.shape}, but must be ({size},)")
     return resolve(row.make)(setting)

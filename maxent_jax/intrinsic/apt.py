@@ -55,7 +55,7 @@ def reward(fixed: Icm, state: State, steps: Steps) -> tuple[State, jax.Array]:
     Raises:
       ValueError: B <= 12.
     """
-    embedding = icm.embed(fixed, state.icm.parameters, steps.next_observation)
+    embedding = icm.embed(fixed, state.icm.parameters, steps.next_features)
     nearest = particles.distances(embedding, steps.row, NUM_NEIGHBORS)
     state = state._replace(distances=moments.update(state.distances, nearest.reshape(-1)))
     relative = nearest / jnp.maximum(state.distances.mean, MEAN_FLOOR)

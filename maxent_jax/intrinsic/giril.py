@@ -63,7 +63,7 @@ def build(setting: Setting) -> Giril:
     return Giril(
         setting=setting,
         encoder=Actor(setting.action_size, HIDDEN_LAYERS, HIDDEN_SIZE),
-        decoder=Mlp(HIDDEN_LAYERS, HIDDEN_SIZE, setting.observation_size),
+        decoder=Mlp(HIDDEN_LAYERS, HIDDEN_SIZE, setting.num_features),
         optimizer=protocol.optimizer(setting),
     )
 
@@ -71,7 +71,7 @@ def build(setting: Setting) -> Giril:
 def init(giril: Giril, key: jax.Array) -> Learned:
     """Returns random networks."""
     key_encoder, key_decoder = jax.random.split(key)
-    dims, num_actions = giril.setting.observation_size, giril.setting.action_size
+    dims, num_actions = giril.setting.num_features, giril.setting.action_size
     parameters = Parameters(
         encoder=giril.encoder.init(key_encoder, jnp.zeros((1, 2 * dims))),
         decoder=giril.decoder.init(key_decoder, jnp.zeros((1, dims + num_actions))),
@@ -106,8 +106,8 @@ def learn(giril: Giril, state: Learned, steps: Steps, key: jax.Array) -> tuple[L
 
 def encode(giril: Giril, parameters: Parameters, steps: Steps) -> tuple[jax.Array, jax.Array]:
     """Returns the mean and the log standard deviation of the code, [B, A] each."""
-    before = protocol.scaled(giril.setting, steps.observation)
-    after = protocol.scaled(giril.setting, steps.next_observation)
+    before = protocol.scaled(giril.setting, steps.features)
+    after = protocol.scaled(giril.setting, steps.next_features)
     both = jnp.concatenate([before, after], axis=-1)
     return cast(tuple[jax.Array, jax.Array], giril.encoder.apply(parameters.encoder, both))
 
@@ -115,11 +115,11 @@ def encode(giril: Giril, parameters: Parameters, steps: Steps) -> tuple[jax.Arra
 def decoding_error(
     giril: Giril, parameters: Parameters, steps: Steps, action: jax.Array
 ) -> jax.Array:
-    """Returns the decoded minus the true next state, [B, D], given actions or codes [B, A]."""
-    before = protocol.scaled(giril.setting, steps.observation)
+    """Returns the decoded minus the true next state, [B, F], given actions or codes [B, A]."""
+    before = protocol.scaled(giril.setting, steps.features)
     cause = jnp.concatenate([before, action], axis=-1)
     decoded = cast(jax.Array, giril.decoder.apply(parameters.decoder, cause))
-    return decoded - protocol.scaled(giril.setting, steps.next_observation)
+    return decoded - protocol.scaled(giril.setting, steps.next_features)
 
 
 def divergence_from_prior(mean: jax.Array, log_std: jax.Array) -> jax.Array:

@@ -44,5 +44,4 @@ def refresh(state: State, share: jax.Array) -> State:
 
 def reward(state: State, steps: Steps) -> tuple[State, jax.Array]:
     """Returns the reward [B] of `steps.cell`."""
-    assert steps.cell is not None
     return state, state.payment[steps.cell]

@@ -68,11 +68,11 @@ def build(setting: Setting) -> Icm:
 def init(icm: Icm, key: jax.Array) -> Learned:
     """Returns random networks."""
     key_trunk, key_forward, key_inverse = jax.random.split(key, 3)
-    observation = jnp.zeros((1, icm.setting.observation_size))
+    features = jnp.zeros((1, icm.setting.num_features))
     embedding = jnp.zeros((1, EMBEDDING_SIZE))
     action = jnp.zeros((1, icm.setting.action_size))
     parameters = Parameters(
-        trunk=icm.trunk.init(key_trunk, observation),
+        trunk=icm.trunk.init(key_trunk, features),
         forward=icm.forward.init(key_forward, jnp.concatenate([embedding, action], axis=-1)),
         inverse=icm.inverse.init(key_inverse, jnp.concatenate([embedding, embedding], axis=-1)),
     )
@@ -97,16 +97,16 @@ def learn(icm: Icm, state: Learned, steps: Steps, key: jax.Array) -> tuple[Learn
     return descent.descend(icm.optimizer, state, loss)
 
 
-def embed(icm: Icm, parameters: Parameters, observation: jax.Array) -> jax.Array:
-    """Embeds observations, [B, D] -> [B, F] in [-1, 1]."""
-    inputs = protocol.scaled(icm.setting, observation)
+def embed(icm: Icm, parameters: Parameters, features: jax.Array) -> jax.Array:
+    """Embeds features, [B, F] -> [B, E] in [-1, 1]."""
+    inputs = protocol.scaled(icm.setting, features)
     return cast(jax.Array, icm.trunk.apply(parameters.trunk, inputs))
 
 
 def errors(icm: Icm, parameters: Parameters, steps: Steps) -> tuple[jax.Array, jax.Array]:
     """Returns the lengths of the forward and the inverse model's errors, [B] each."""
-    before = embed(icm, parameters, steps.observation)
-    after = embed(icm, parameters, steps.next_observation)
+    before = embed(icm, parameters, steps.features)
+    after = embed(icm, parameters, steps.next_features)
     cause = jnp.concatenate([before, steps.action], axis=-1)
     expected = cast(jax.Array, icm.forward.apply(parameters.forward, cause))
     both = jnp.concatenate([before, after], axis=-1)

@@ -26,9 +26,9 @@ MAX_FOLLOWED = 128
 
 
 class State(NamedTuple):
-    """The centres, in scaled observations, and how many states have moved each."""
+    """The centres, in scaled features, and how many states have moved each."""
 
-    centers: jax.Array  # [C, D]
+    centers: jax.Array  # [C, F]
     counts: jax.Array  # [C] int32
 
 
@@ -43,14 +43,14 @@ def make(setting: Setting) -> Bonus:
 
 def init(setting: Setting, key: jax.Array) -> State:
     """Draws centres uniformly from [-1, 1]."""
-    shape = (NUM_CENTERS, setting.observation_size)
+    shape = (NUM_CENTERS, setting.num_features)
     centers = jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
     return State(centers, jnp.zeros(NUM_CENTERS, jnp.int32))
 
 
 def reward(setting: Setting, state: State, steps: Steps) -> tuple[State, jax.Array]:
     """Returns what each state alone would add to the sum of roots by moving its centre, [B]."""
-    states = protocol.scaled(setting, steps.next_observation)
+    states = protocol.scaled(setting, steps.next_features)
     chosen = nearest_center(state, states)
     moved = _moved(state.centers[chosen], states)
     return state, gains(state.centers, chosen, moved)
@@ -58,7 +58,7 @@ def reward(setting: Setting, state: State, steps: Steps) -> tuple[State, jax.Arr
 
 def learn(setting: Setting, state: State, steps: Steps, key: jax.Array) -> tuple[State, Metrics]:
     """Lets the states of the batch move their centres, one after the other in random order."""
-    states = jax.random.permutation(key, protocol.scaled(setting, steps.next_observation))
+    states = jax.random.permutation(key, protocol.scaled(setting, steps.next_features))
     states = states[:MAX_FOLLOWED]
 
     def follow(state: State, point: jax.Array):
@@ -73,7 +73,7 @@ def learn(setting: Setting, state: State, steps: Steps, key: jax.Array) -> tuple
 
 
 def nearest_center(state: State, states: jax.Array) -> jax.Array:
-    """Returns the centre with the least distance + κ (count - mean count), [B, D] -> [B] int."""
+    """Returns the centre with the least distance + κ (count - mean count), [B, F] -> [B] int."""
     counts = state.counts.astype(jnp.float32)
     offset = BALANCE * (counts - jnp.mean(counts))
     return jnp.argmin(_distances(states, state.centers) + offset[None], axis=-1)
@@ -83,9 +83,9 @@ def gains(centers: jax.Array, chosen: jax.Array, moved: jax.Array) -> jax.Array:
     """Returns by how much the sum over centres of f(distance to the nearest other) would rise.
 
     Args:
-      centers: [C, D].
+      centers: [C, F].
       chosen: [B] int, the only centre that moves.
-      moved: [B, D] its new place.
+      moved: [B, F] its new place.
     Returns:
       [B] the rise.
     """
@@ -108,5 +108,5 @@ def _moved(center: jax.Array, state: jax.Array) -> jax.Array:
 
 
 def _distances(points: jax.Array, others: jax.Array) -> jax.Array:
-    """[B, D], [C, D] -> [B, C], by differences, so that no small distance is lost."""
+    """[B, F], [C, F] -> [B, C], by differences, so that no small distance is lost."""
     return jnp.sqrt(jnp.sum((points[:, None] - others[None]) ** 2, axis=-1))

@@ -89,7 +89,7 @@ def reward(metra: Metra, state: State, steps: Steps) -> tuple[State, jax.Array]:
     Raises:
       ValueError: the steps have no skill.
     """
-    if steps.next_state is None or steps.skill is None:
+    if steps.skill is None:
         raise ValueError("METRA rewards skills, but the steps have none")
     measuring = jnp.full(steps.row.shape, jnp.max(steps.row) < NUM_MEASURED)
     state = state._replace(inputs=moments.update(state.inputs, steps.next_state, measuring))

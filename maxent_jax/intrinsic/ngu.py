@@ -91,9 +91,9 @@ def make(setting: Setting) -> Bonus:
 def init(ngu: Ngu, key: jax.Array) -> State:
     """Returns random networks, and empty normalisers."""
     key_rnd, key_embedding, key_inverse = jax.random.split(key, 3)
-    observation = jnp.zeros((1, ngu.setting.observation_size))
+    features = jnp.zeros((1, ngu.setting.num_features))
     parameters = Parameters(
-        embedding=ngu.embedding.init(key_embedding, observation),
+        embedding=ngu.embedding.init(key_embedding, features),
         inverse=ngu.inverse.init(key_inverse, jnp.zeros((1, 2 * EMBEDDING_SIZE))),
     )
     return State(
@@ -103,9 +103,9 @@ def init(ngu: Ngu, key: jax.Array) -> State:
     )
 
 
-def embed(ngu: Ngu, state: State, observation: jax.Array) -> jax.Array:
+def embed(ngu: Ngu, state: State, features: jax.Array) -> jax.Array:
     """Embeds states, [N, D] -> [N, F]."""
-    return _embedding(ngu, state.controllable.parameters, observation)
+    return _embedding(ngu, state.controllable.parameters, features)
 
 
 def novelty(
@@ -148,8 +148,8 @@ def learn(ngu: Ngu, state: State, steps: Steps, key: jax.Array) -> tuple[State, 
     """Takes one gradient step of RND's predictor, and one of the embedding and inverse model."""
 
     def loss(parameters):
-        before = _embedding(ngu, parameters, steps.observation)
-        after = _embedding(ngu, parameters, steps.next_observation)
+        before = _embedding(ngu, parameters, steps.features)
+        after = _embedding(ngu, parameters, steps.next_features)
         both = jnp.concatenate([before, after], axis=-1)
         guess = cast(jax.Array, ngu.inverse.apply(parameters.inverse, both))
         value = jnp.mean((guess - steps.action) ** 2)
@@ -160,6 +160,6 @@ def learn(ngu: Ngu, state: State, steps: Steps, key: jax.Array) -> tuple[State, 
     return state._replace(rnd=lifelong, controllable=controllable), metrics | metrics_rnd
 
 
-def _embedding(ngu: Ngu, parameters: Parameters, observation: jax.Array) -> jax.Array:
-    inputs = protocol.scaled(ngu.setting, observation)
+def _embedding(ngu: Ngu, parameters: Parameters, features: jax.Array) -> jax.Array:
+    inputs = protocol.scaled(ngu.setting, features)
     return cast(jax.Array, ngu.embedding.apply(parameters.embedding, inputs))

@@ -88,7 +88,7 @@ def init(proto: Proto, key: jax.Array) -> State:
     key_network, key_projector, key_prototypes, key_draw = jax.random.split(key, 4)
     prototypes = jax.random.normal(key_prototypes, (NUM_PROTOTYPES, EMBEDDING_SIZE))
     parameters = Parameters(
-        network=proto.network.init(key_network, jnp.zeros((1, proto.setting.observation_size))),
+        network=proto.network.init(key_network, jnp.zeros((1, proto.setting.num_features))),
         projector=proto.projector.init(key_projector, jnp.zeros((1, EMBEDDING_SIZE))),
         prototypes=_of_length_1(prototypes),
     )
@@ -109,7 +109,7 @@ def reward(proto: Proto, state: State, steps: Steps) -> tuple[State, jax.Array]:
     """
     parameters = state.online.parameters
     key, key_draw = jax.random.split(jax.random.wrap_key_data(state.key))
-    embedding = embed(proto, parameters.network, steps.next_observation)
+    embedding = embed(proto, parameters.network, steps.next_features)
     drawn = draw(parameters.prototypes @ embedding.T, key_draw)
     queue = jnp.concatenate([embedding[drawn], state.queue[:-NUM_PROTOTYPES]])
     filled = jnp.minimum(state.filled + NUM_PROTOTYPES, QUEUE_SIZE)
@@ -128,11 +128,11 @@ def learn(proto: Proto, state: State, steps: Steps, key: jax.Array) -> tuple[Sta
     """Takes one gradient step of networks and prototypes; the slow copy follows."""
     del key
     prototypes = state.online.parameters.prototypes
-    reached = embed(proto, state.target, steps.next_observation)
+    reached = embed(proto, state.target, steps.next_features)
     assigned = sinkhorn(reached @ prototypes.T / TEMPERATURE)
 
     def loss(parameters):
-        embedding = _embedding(proto, parameters.network, steps.observation)
+        embedding = _embedding(proto, parameters.network, steps.features)
         projected = cast(jax.Array, proto.projector.apply(parameters.projector, embedding))
         scores = _of_length_1(projected) @ parameters.prototypes.T
         log_p = jax.nn.log_softmax(scores / TEMPERATURE)
@@ -147,9 +147,9 @@ def learn(proto: Proto, state: State, steps: Steps, key: jax.Array) -> tuple[Sta
     return state._replace(online=online, target=target), metrics
 
 
-def embed(proto: Proto, network: Any, observation: jax.Array) -> jax.Array:
-    """Embeds observations, [B, D] -> [B, F] of length 1."""
-    return _of_length_1(_embedding(proto, network, observation))
+def embed(proto: Proto, network: Any, features: jax.Array) -> jax.Array:
+    """Embeds features, [B, F] -> [B, E] of length 1."""
+    return _of_length_1(_embedding(proto, network, features))
 
 
 def draw(scores: jax.Array, key: jax.Array) -> jax.Array:
@@ -178,8 +178,8 @@ def sinkhorn(scores: jax.Array) -> jax.Array:
     return shares
 
 
-def _embedding(proto: Proto, network: Any, observation: jax.Array) -> jax.Array:
-    inputs = protocol.scaled(proto.setting, observation)
+def _embedding(proto: Proto, network: Any, features: jax.Array) -> jax.Array:
+    inputs = protocol.scaled(proto.setting, features)
     return cast(jax.Array, proto.network.apply(network, inputs))
 
 

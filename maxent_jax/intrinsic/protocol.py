@@ -3,8 +3,8 @@
 Every bonus rewards the state that a transition reached. It sees transitions drawn from a replay,
 as in URLB (Laskin et al. 2021, github.com/rll-research/url_benchmark): what its method computes
 from the newest rollout, it computes from the batch. It computes the rewards of all minibatches of a
-vector step together, and then learns from one minibatch after the other. The observations that it
-sees are features φ(s).
+vector step together, and then learns from one minibatch after the other. It sees
+features φ(s), as the distance to the reference does, and the states themselves.
 """
 
 from collections.abc import Callable
@@ -27,26 +27,26 @@ EMBEDDING_SIZE = 50
 class Steps(NamedTuple):
     """A batch of transitions, as a bonus sees it."""
 
-    observation: jax.Array  # [B, D]
+    features: jax.Array  # [B, F] φ of the state left
     action: jax.Array  # [B, A], in [-1, 1]
-    next_observation: jax.Array  # [B, D]
-    value: jax.Array  # [B] the critics' value of next_observation
+    next_features: jax.Array  # [B, F] φ of the state reached
+    value: jax.Array  # [B] the critics' value of the state reached
     episodic: jax.Array  # [B] from Episodic.novelty when the step was taken; 0 without it
     row: jax.Array  # [B] int32, equal for copies of one transition that was drawn more than once
-    cell: jax.Array | None = None  # [B] int32 of the grid, where the step arrived; num_cells off it
-    state: jax.Array | None = None  # [B, I] what the networks see, without the skill
-    next_state: jax.Array | None = None  # [B, I]
-    skill: jax.Array | None = None  # [B, Z]
+    cell: jax.Array  # [B] int32 of the grid, where the step arrived; num_cells off it
+    state: jax.Array  # [B, I] the state left, as the networks see it, without the skill
+    next_state: jax.Array  # [B, I]
+    skill: jax.Array | None = None  # [B, Z]; None without skills
 
 
 class Episodic(NamedTuple):
     """The part that is computed when a step is taken, since it depends on the episode so far."""
 
-    size: int  # F of an embedding
+    size: int  # E of an embedding
     embed: Callable[[State, jax.Array], jax.Array]
-    """state, observation [N, D] -> embedding [N, F]"""
+    """state, features [N, F] -> embedding [N, E]"""
     novelty: Callable[[State, jax.Array, jax.Array, jax.Array], tuple[State, jax.Array]]
-    """state, embedding [N, F], earlier [N, T, F], count [N] -> state, [N]
+    """state, embedding [N, E], earlier [N, T, E], count [N] -> state, [N]
 
     `earlier` holds the embeddings of each episode's earlier states; the first `count` are filled.
     """
@@ -78,19 +78,19 @@ class Bonus(NamedTuple):
 class Setting(NamedTuple):
     """The arguments from which every bonus is made."""
 
-    observation_size: int  # D
+    num_features: int  # F
     action_size: int  # A
-    scale: jax.Array  # [D] positive, the unit of each entry of an observation
+    scale: jax.Array  # [F] positive, the unit of each feature
     learning_rate: float  # of Adam, if the bonus learns by gradients
     num_cells: int  # of the grid on which coverage is counted
-    state_size: int = 0  # I, of what the networks see, without the skill
+    state_size: int  # I, of what the networks see, without the skill
     skill_size: int = 0  # Z
     hidden_size: int = HIDDEN_SIZE  # of the actor and the critics
 
 
-def scaled(setting: Setting, observation: jax.Array) -> jax.Array:
-    """Returns observations [B, D] in units of the scale, as networks and distances see them."""
-    return observation / setting.scale[None]
+def scaled(setting: Setting, features: jax.Array) -> jax.Array:
+    """Returns features [B, F] in units of the scale, as networks and distances see them."""
+    return features / setting.scale[None]
 
 
 def optimizer(setting: Setting) -> optax.GradientTransformation:

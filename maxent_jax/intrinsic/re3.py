@@ -44,7 +44,7 @@ def make(setting: Setting) -> Bonus:
 
 def init(re3: Re3, key: jax.Array) -> Any:
     """Returns a random encoder."""
-    return re3.encoder.init(key, jnp.zeros((1, re3.setting.observation_size)))
+    return re3.encoder.init(key, jnp.zeros((1, re3.setting.num_features)))
 
 
 def reward(re3: Re3, state: Any, steps: Steps) -> tuple[Any, jax.Array]:
@@ -53,6 +53,6 @@ def reward(re3: Re3, state: Any, steps: Steps) -> tuple[Any, jax.Array]:
     Raises:
       ValueError: B <= 3.
     """
-    inputs = protocol.scaled(re3.setting, steps.next_observation)
+    inputs = protocol.scaled(re3.setting, steps.next_features)
     embedding = cast(jax.Array, re3.encoder.apply(state, inputs))
     return state, jnp.log1p(particles.distances(embedding, steps.row, NUM_NEIGHBORS)[:, -1])

@@ -41,7 +41,7 @@ def reward(
     Raises:
       ValueError: B <= 5.
     """
-    states = protocol.scaled(setting, steps.next_observation)
+    states = protocol.scaled(setting, steps.next_features)
     return state, particles.distances(states, steps.row, NUM_NEIGHBORS)[:, -1] ** (1 - order)
 
 
@@ -53,7 +53,7 @@ def renyi_reward(setting: Setting, state: State, steps: Steps) -> tuple[State, j
     Raises:
       ValueError: B <= 5.
     """
-    states = protocol.scaled(setting, steps.next_observation)
+    states = protocol.scaled(setting, steps.next_features)
     nearest = particles.distances(states, steps.row, NUM_NEIGHBORS)[:, -1]
     num_states, dims = states.shape
     log_p = rewards.floored_log_density(nearest, num_states - 1, NUM_NEIGHBORS, dims)

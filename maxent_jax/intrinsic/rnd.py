@@ -3,7 +3,7 @@
 Burda et al. 2018, "Exploration by random network distillation", arXiv 1810.12894. Their code
 (github.com/openai/random-network-distillation) divides by the standard deviation of the reward's
 discounted return. URLB, whose transitions have no order, divides by that of the reward, as we do.
-URLB normalises observations over the batch; we do so over all observations so far, as RND's authors
+URLB normalises what it sees over the batch; we do so over all that it saw so far, as RND's authors
 do. Their predictor has two layers more than the target; ours has the target's layers, as in URLB.
 """
 
@@ -24,7 +24,7 @@ from maxent_jax.types import Metrics
 
 OUTPUT_SIZE = 512  # rep_size of their code, rnd_rep_dim of URLB
 OBSERVATION_LIMIT = 5.0  # standard deviations (2.4 of the paper)
-VARIANCE_FLOOR = 1e-5  # of an observation, in units of its scale; from URLB's batch norm
+VARIANCE_FLOOR = 1e-5  # of a feature, in units of its scale; from URLB's batch norm
 STD_FLOOR = 1e-8  # of the error: URLB
 
 
@@ -41,7 +41,7 @@ class State(NamedTuple):
 
     target: Any
     predictor: Learned
-    observations: Moments  # [D]
+    observations: Moments  # [F] of the features seen
     errors: Moments  # []
 
 
@@ -64,11 +64,11 @@ def build(setting: Setting) -> Rnd:
 def init(rnd: Rnd, key: jax.Array) -> State:
     """Returns a random predictor and target, and empty normalisers."""
     key_target, key_predictor = jax.random.split(key)
-    inputs = jnp.zeros((1, rnd.setting.observation_size))
+    inputs = jnp.zeros((1, rnd.setting.num_features))
     return State(
         target=rnd.network.init(key_target, inputs),
         predictor=descent.begin(rnd.optimizer, rnd.network.init(key_predictor, inputs)),
-        observations=moments.init((rnd.setting.observation_size,)),
+        observations=moments.init((rnd.setting.num_features,)),
         errors=moments.init(),
     )
 
@@ -81,7 +81,7 @@ def reward(rnd: Rnd, state: State, steps: Steps) -> tuple[State, jax.Array]:
 
 def advance(rnd: Rnd, state: State, steps: Steps) -> tuple[State, jax.Array]:
     """Updates the normalisers with the steps; also returns their errors [B], not normalised."""
-    met = protocol.scaled(rnd.setting, steps.next_observation)
+    met = protocol.scaled(rnd.setting, steps.next_features)
     state = state._replace(observations=moments.update(state.observations, met))
     error = prediction_error(rnd, state, state.predictor.parameters, steps)
     return state._replace(errors=moments.update(state.errors, error)), error
@@ -103,7 +103,7 @@ def prediction_error(rnd: Rnd, state: State, parameters: Any, steps: Steps) -> j
     """Returns the mean squared error of a predictor with these parameters, [B]."""
     seen = state.observations
     std = jnp.sqrt(seen.variance + VARIANCE_FLOOR)
-    inputs = (protocol.scaled(rnd.setting, steps.next_observation) - seen.mean[None]) / std[None]
+    inputs = (protocol.scaled(rnd.setting, steps.next_features) - seen.mean[None]) / std[None]
     inputs = jnp.clip(inputs, -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
     wanted = cast(jax.Array, rnd.network.apply(state.target, inputs))
     predicted = cast(jax.Array, rnd.network.apply(parameters, inputs))

@@ -39,8 +39,8 @@ def reward(setting: Setting, state: State, steps: Steps) -> tuple[State, jax.Arr
     Raises:
       ValueError: B <= 12.
     """
-    dims = setting.observation_size
-    states = protocol.scaled(setting, steps.next_observation) / dims
+    dims = setting.num_features
+    states = protocol.scaled(setting, steps.next_features) / dims
     deviation = steps.value - jnp.mean(steps.value)
     values = deviation / jnp.sqrt(jnp.mean(deviation**2) + VARIANCE_FLOOR)
     distance, count = joint_neighbors(states, values, steps.row, NUM_NEIGHBORS)
