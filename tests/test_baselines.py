@@ -123,8 +123,8 @@ def payer(column):
 
 
 COLUMNS = {
-    "where it came from": lambda steps: steps.observation[:, 0],
-    "where it went": lambda steps: steps.next_observation[:, 0],
+    "where it came from": lambda steps: steps.features[:, 0],
+    "where it went": lambda steps: steps.next_features[:, 0],
     "what it did": lambda steps: steps.action[:, 0],
     "the cell": lambda steps: steps.cell.astype(jnp.float32),
     "the row": lambda steps: steps.row.astype(jnp.float32),

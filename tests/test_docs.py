@@ -82,6 +82,7 @@ def blocks(page):
 )
 def test_the_python_of_a_page_runs(page, smoke_run, tmp_path, monkeypatch):
     shutil.copytree(smoke_run, tmp_path / "runs" / "ant")
+    (tmp_path / "runs" / "ant-seeds").symlink_to("ant")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", os.environ.get("XDG_CACHE_HOME", str(tmp_path)))
     names = {"__name__": "page"}

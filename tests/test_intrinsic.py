@@ -227,7 +227,7 @@ def test_rnd_pays_the_error_over_its_running_deviation():
     _, init, step = made("rnd")
     state = init(KEY)
     batches = [steps_of(seed) for seed in (1, 2)]
-    batches[1].next_observation[0, 0] = 1e4  # is clipped
+    batches[1].next_features[0, 0] = 1e4  # is clipped
     met, errors = np.zeros((0, D)), []
     for batch in batches:
         after = np.float64(batch.next_features) / SCALE
@@ -565,7 +565,7 @@ def test_without_a_difference_in_value_vcse_is_the_entropy_of_states():
 
 
 def test_vcse_measures_states_among_those_of_their_value_alone():
-    low, high = (np.float64(steps_of(s, 40).next_observation) / SCALE for s in (3, 4))
+    low, high = (np.float64(steps_of(s, 40).next_features) / SCALE for s in (3, 4))
     low[0] = high.mean(0)  # crowded, but not by states of its value
     both = np.concatenate([low, high])
     value = np.repeat(np.float32([-1, 1]), 40)
@@ -674,11 +674,11 @@ def test_metra_pays_the_step_along_the_skill_in_its_space():
         bonus.reward(state, batch._replace(skill=None))
 
 
-def test_metra_measures_its_first_states_and_no_more():
+def test_metra_measures_states_until_the_replay_holds_10_000():
     bonus, init, _ = made("metra")
     state, batch = init(KEY), steps_of(size=4000)
-    for seen in (4000, 8000, 12000, 12000, 12000):
-        state, _ = bonus.reward(state, batch)
+    for newest, seen in ((4000, 4000), (9999, 8000), (10_000, 8000), (50_000, 8000)):
+        state, _ = bonus.reward(state, batch._replace(row=newest - batch.row))
         np.testing.assert_allclose(state.inputs.weight, seen, rtol=1e-6)
 
 

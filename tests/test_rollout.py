@@ -1,5 +1,7 @@
 """Episodes of a mixture to their ends, their weights, and the scores of its policies."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -293,6 +295,11 @@ def expected_scores(found, points, rows, config, size, capacity=4):
 
 
 @pytest.mark.slow
+def bare(config):
+    """Components that can score, and no more."""
+    return Components(config, *[None] * 5, phi=SimpleNamespace(names=("x", "y")))
+
+
 @pytest.mark.parametrize("leave_own_out", [False, True])
 @pytest.mark.parametrize("source", ["mixture", "history"])
 @pytest.mark.parametrize(("num_policies", "snapshots"), [(1, 1), (3, 1), (3, 2)])
@@ -303,9 +310,7 @@ def test_scores_are_those_by_hand(key, leave_own_out, source, num_policies, snap
     points = found.features[rows]
     if source == "history":  # points that no state of these rollouts is
         points, rows = points + 0.1, jnp.full_like(rows, -1)
-    scores = occupancy.score(
-        Components(config, *[None] * 6), found, points, rows, archive_of(num_policies)
-    )
+    scores = occupancy.score(bare(config), found, points, rows, archive_of(num_policies))
     expected = expected_scores(found, points, rows, config, num_policies)
     # Sums of up to 60 float32 rewards of order 1.
     np.testing.assert_allclose(scores.episode_return, expected[0], rtol=1e-5)
@@ -320,7 +325,7 @@ def test_a_parked_policy_scores_low_only_among_its_own_states():
     rows = jnp.arange(NUM_STATES, dtype=jnp.int32)
     best = {}
     for leave_own_out in (False, True):
-        p = Components(preset("smoke", leave_own_out=leave_own_out), *[None] * 6)
+        p = bare(preset("smoke", leave_own_out=leave_own_out))
         scores = occupancy.score(p, found, found.features, rows, archive_of(2))
         best[leave_own_out] = int(occupancy.best(scores, found))
         if not leave_own_out:
@@ -338,7 +343,7 @@ def test_a_policy_that_made_the_whole_reference_sees_its_own_states(key):
         assert (found.policy[seen] != 2).sum() == num_foreign
         scores = {
             leave_own_out: occupancy.score(
-                Components(preset("smoke", leave_own_out=leave_own_out), *[None] * 6),
+                bare(preset("smoke", leave_own_out=leave_own_out)),
                 found,
                 found.features[seen],
                 seen,
@@ -356,7 +361,7 @@ def test_a_policy_without_weight_is_scored_all_the_same(key):
     # As MaxEnt-H weighs its older policies: they play, and the mixture does without them.
     found = hand_made(key)
     weightless = found._replace(weight=jnp.where(found.policy == 0, 0.0, found.weight))
-    p = Components(preset("smoke"), *[None] * 6)
+    p = bare(preset("smoke"))
     rows = jnp.arange(NUM_STATES, dtype=jnp.int32)
     scores = [
         occupancy.score(p, each, found.features, rows, archive_of(3))

@@ -109,7 +109,15 @@ def visit(components: Components, visits: Visits, states: jax.Array, counts: jax
 def visit_plane(
     components: Components, visited: jax.Array | None, states: jax.Array, counts: jax.Array
 ) -> jax.Array | None:
-    """Adds states to the visited unit cells, as `visit`; None where positions are not metres."""
+    """Adds states to the visited unit cells.
+
+    Args:
+      visited: [SIDE, SIDE] bool, see plane.empty; None where positions are not metres.
+      states: [B, D] states.
+      counts: [B] bool, the states that count.
+    Returns:
+      [SIDE, SIDE] bool, or None.
+    """
     if visited is None:
         return None
     return plane.visit(visited, histogram.locate(states, components.grid), counts)
