@@ -191,7 +191,7 @@ def test_an_episode_is_played_by_its_own_policy(key):
 
 @pytest.mark.slow
 def test_a_policy_can_be_drawn_for_each_step(key):
-    p = make_parts(mixing="step", leave_own_out=False)
+    p = make_parts(mixing="step", leave_own_out=False, start="last")
     starts = make_starts(p)
     archive = push_apart(make_archive(p, 2))
     run = jax.jit(lambda a, w, s, k: occupancy.of_mixture(p, a, w, s, k))
