@@ -6,6 +6,7 @@ from maxent_jax.config import from_flat, preset
 from maxent_jax.config.presets import PRESETS
 from maxent_jax.config.registry import ENVS, METHODS, TASK
 from maxent_jax.errors import ConfigError
+from maxent_jax.runs import files
 
 
 @pytest.mark.parametrize("env", [*ENVS, "brax:halfcheetah", "user:mine"])
@@ -104,6 +105,14 @@ def test_an_environment_that_has_v_start_from_scratch_leaves_the_others_their_ow
     }
     assert starts.pop("v") == "scratch"
     assert set(starts.values()) == {"method"}
+
+
+def test_a_run_of_an_earlier_release_is_loaded_although_a_setting_has_no_effect(tmp_path):
+    config = preset("smoke").replace(eta=0.2)
+    files.write_config(tmp_path, config, {}, {})
+    assert files.read_config(tmp_path) == config
+    with pytest.raises(ConfigError, match="only geometric weights have an eta"):
+        config.check_new()
 
 
 def test_configs_of_all_methods_share_one_program():

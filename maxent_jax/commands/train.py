@@ -105,6 +105,7 @@ def check_arguments(arguments: Arguments) -> None:
     arguments.config.check_registered()
     resumed = arguments.resume and integrity.checkpoints(arguments.directory)
     if not resumed:  # a run that is resumed no longer needs its source
+        arguments.config.check_new()
         source.check(arguments.config)
     _check_saving(arguments)
     _check_hosts(arguments)
@@ -254,6 +255,8 @@ def train(config: Config, out: str | Path, resume: bool = False, overwrite: bool
     from maxent_jax.runs import driver
 
     started, directory = time.perf_counter(), check_path("out", out)
+    if not (resume and integrity.checkpoints(directory)):
+        config.check_new()
     claim = Claim(directory, config, resume, overwrite)
     claim.check()
     runtime.prepare(config.simulates_in_jax)

@@ -22,6 +22,55 @@ def problems(settings: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
     return itertools.chain.from_iterable(group(settings, row) for group in groups)
 
 
+def problems_of_new_runs(c: SimpleNamespace) -> Iterator[str]:
+    """Yields a sentence for each setting that would have no effect, or not the one it should have.
+
+    A run of an earlier release may have such settings, so it is loaded all the same.
+
+    Args:
+      c: every setting by name, of which `problems` finds none.
+    """
+    of_method = registry.METHODS.get(c.method)  # none: a user's, not registered yet
+    weights, start = c.weights, c.start
+    if of_method is not None:
+        weights = of_method.weights if weights == "method" else weights
+        start = of_method.start if start == "method" else start
+    if c.mixing == "step" and start == "best":
+        yield (
+            f"mixing is step, so no state belongs to one policy, and none is the best: start "
+            f"{_start_in_words(c)} needs mixing episode, or choose start last or scratch."
+        )
+    if c.intrinsic_weight == 0 and start == "best":
+        yield (
+            f"intrinsic-weight is 0, so no policy is scored: start {_start_in_words(c)} needs an "
+            f"intrinsic reward, or choose start last or scratch."
+        )
+    if c.eta != names.ETA and weights not in ("geometric", "method"):
+        yield f"eta is {c.eta}, but weights are {weights}: only geometric weights have an eta."
+    if c.shaping_survives_death and not c.shaping:
+        yield "shaping-survives-death is on, but shaping is 0: set shaping, or leave it out."
+    if c.task == tasks.NONE:
+        unused = {"intrinsic_weight": 1.0, "intrinsic_decay": 0, "task_scale": 1.0}
+        for name, default in unused.items():
+            if getattr(c, name) != default:
+                yield (
+                    f"{name.replace('_', '-')} is {getattr(c, name)}, but task is none: it weighs "
+                    f"the intrinsic reward against a task's, so name a task."
+                )
+    if not c.source:
+        for name in ("source_seed", "source_iterations"):
+            if getattr(c, name):
+                yield (
+                    f"{name.replace('_', '-')} is {getattr(c, name)}, but there is no source: name "
+                    f"the directory of a run."
+                )
+    if c.stale_rewards and c.start_from in names.FILLING:
+        yield (
+            f"stale-rewards is on, but start-from is {c.start_from}: the episodes that fill the "
+            f"replay are rewarded only when they are measured again."
+        )
+
+
 def _budget(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
     del row
     segment = c.num_envs * c.num_segments
@@ -68,30 +117,13 @@ def _budget(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
 
 def _mixture(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
     del row
-    of_method = registry.METHODS.get(c.method)  # none: a user's, not registered yet
-    weights, start = c.weights, c.start
-    if of_method is not None:
-        weights = of_method.weights if weights == "method" else weights
-        start = of_method.start if start == "method" else start
     if c.mixing == "step" and (c.pooled or c.leave_own_out or c.weights == CORRECTIVE):
         yield (
             "mixing is step, so no state belongs to one policy: pooled, leave-own-out and fully "
             "corrective weights need mixing episode."
         )
-    if c.mixing == "step" and start == "best":
-        yield (
-            f"mixing is step, so no state belongs to one policy, and none is the best: start "
-            f"{_start_in_words(c)} needs mixing episode, or choose start last or scratch."
-        )
-    if c.intrinsic_weight == 0 and start == "best":
-        yield (
-            f"intrinsic-weight is 0, so no policy is scored: start {_start_in_words(c)} needs an "
-            f"intrinsic reward, or choose start last or scratch."
-        )
     if c.pooled and c.weights == CORRECTIVE:
         yield "pooled needs weights before the rollouts, and fully corrective weights come after."
-    if c.eta != names.ETA and weights not in ("geometric", "method"):
-        yield f"eta is {c.eta}, but weights are {weights}: only geometric weights have an eta."
     policies = 1 + c.num_iterations * c.snapshots
     if c.mixture_episodes < policies:
         yield (
@@ -120,8 +152,6 @@ def _bonus(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
     del row
     if registry.bonus_of(c.method) not in (None, c.bonus):
         yield f"method is {c.method}, but bonus is {c.bonus}: leave bonus out, the method sets it."
-    if c.shaping_survives_death and not c.shaping:
-        yield "shaping-survives-death is on, but shaping is 0: set shaping, or leave it out."
     if c.bonus == "none":
         return
     if c.return_steps > 1 or c.shaping or c.episodic_weight:
@@ -189,31 +219,11 @@ def _downstream(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
         if c.intrinsic_weight == 0:
             what = "method is task" if c.method == registry.TASK else "intrinsic-weight is 0"
             yield f"{what}, but task is none: name a task."
-        unused = {"intrinsic_weight": 1.0, "intrinsic_decay": 0, "task_scale": 1.0}
-        for name, default in unused.items():
-            if getattr(c, name) != default:
-                yield (
-                    f"{name.replace('_', '-')} is {getattr(c, name)}, but task is none: it weighs "
-                    f"the intrinsic reward against a task's, so name a task."
-                )
         if c.start_from in names.PLAYING:
             yield f"start-from is {c.start_from}, but task is none: name the task that is measured."
-    if not c.source:
-        if c.start_from != "scratch":
-            yield (
-                f"start-from is {c.start_from}, but there is no source: name the directory of a "
-                f"run."
-            )
-        for name in ("source_seed", "source_iterations"):
-            if getattr(c, name):
-                yield (
-                    f"{name.replace('_', '-')} is {getattr(c, name)}, but there is no source: name "
-                    f"the directory of a run."
-                )
-    if c.stale_rewards and c.start_from in names.FILLING:
+    if c.start_from != "scratch" and not c.source:
         yield (
-            f"stale-rewards is on, but start-from is {c.start_from}: the episodes that fill the "
-            f"replay are rewarded only when they are measured again."
+            f"start-from is {c.start_from}, but there is no source: name the directory of a run."
         )
     if c.cell_restarts and c.restart_share:
         yield (

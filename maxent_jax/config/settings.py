@@ -2,12 +2,21 @@
 
 import dataclasses
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Annotated, Any
 
 import tyro
 
 from maxent_jax.checks import check_choice
-from maxent_jax.config import names, paper, presets, registry, tasks, validation
+from maxent_jax.config import (
+    compatibility,
+    names,
+    paper,
+    presets,
+    registry,
+    tasks,
+    validation,
+)
 from maxent_jax.config.registry import BY_METHOD, CORRECTIVE
 from maxent_jax.errors import ConfigError, ConfigTypeError
 
@@ -308,6 +317,11 @@ class Config(_Checked):
         """
         return from_flat({**self.flat(), **changes})
 
+    def check_new(self) -> None:
+        """Raises ConfigError if a setting has no effect, or not the one that it should have."""
+        for sentence in compatibility.problems_of_new_runs(SimpleNamespace(**self.flat())):
+            raise ConfigError(sentence)
+
     def check_registered(self) -> None:
         """Raises ConfigError if a user's environment, method, bonus or task is not registered."""
         registry.check_registered(self.env, self.method, self.intrinsic.bonus)
@@ -319,7 +333,7 @@ class Config(_Checked):
         Configs with equal programs share one compilation; the data enters the state in
         `algorithm.init`.
         """
-        defaults = {name: DEFAULTS[name] for name in DATA_FIELDS} | {"start": "last"}
+        defaults = {name: DEFAULTS[name] for name in DATA_FIELDS}
         if self.mixture.weights == CORRECTIVE:  # a computation, not a table
             del defaults["weights"]
         return self.replace(**defaults)
@@ -387,7 +401,9 @@ def preset(name: str, **changes: Any) -> Config:
     of_protocol = presets.of_protocol(changes.get("protocol", Config.protocol), env)
     of_task = tasks.settings(changes.get("task", tasks.NONE), env)
     settings = {**presets.PRESETS[name], **in_env, **of_method, **of_both, **of_protocol, **of_task}
-    return from_flat({"preset": name, **settings, **changes})
+    config = from_flat({"preset": name, **settings, **changes})
+    config.check_new()
+    return config
 
 
 def _check_settings(settings: Mapping[str, Any]) -> None:
