@@ -21,7 +21,6 @@ VERSION = 1  # of the layout of a study's directory
 SCALES = ("toy", "cpu", "paper")
 ETAS = (0.1, 0.01, 0.001)
 SCRATCH = "scratch"  # the method that does not explore before a task
-EXPLORED = (0.25, 1.0)  # shares of the iterations of exploration before a task
 
 Changes = dict[str, Any]
 
@@ -52,6 +51,9 @@ class Scale(NamedTuple):
     preset: str
     num_seeds: Mapping[str, int]  # by environment
     changes: Mapping[str, Any] = MappingProxyType({})  # to the preset, in every cell
+    methods: Sequence[str] = ()  # of the study's; if empty, all
+    then: Mapping[str, Sequence[str]] = MappingProxyType({})  # tasks to train on next, by env
+    explored: Sequence[float] = (0.25, 1.0)  # shares of the exploration after which tasks follow
 
 
 class Study(NamedTuple):
@@ -63,7 +65,6 @@ class Study(NamedTuple):
     together: bool = False  # all seeds in one run, instead of one run per seed
     mepol: bool = False  # also runs MEPOL, at the same env steps
     along: str = ""  # the number in which the methods differ: see results.ALONG
-    then: Mapping[str, Sequence[str]] = MappingProxyType({})  # tasks to train on next, by env
     relabelled: Mapping[str, Sequence[str]] = MappingProxyType({})  # tasks of its data, by env
 
 
@@ -194,15 +195,27 @@ STUDIES: dict[str, Study] = {
             **{name: {"method": name} for name in ("apt", "rnd", "icm", "proto")},
         },
         {
-            "toy": TOY,
-            "cpu": Scale("quick", {"ant": 5, "walker2d": 5}, {"policy_lag": 0}),
-            "paper": Scale("paper", dict.fromkeys(MUJOCO_ENVS, 10)),
-        },
-        then={
-            "pendulum": ("gymnasium",),
-            "ant": ("run:0", "run:90", "run:180", "run:270", "goal:15,0", "goal:0,-15"),
-            "walker2d": ("forward", "backward", "flip", "stand"),
-            "humanoid": ("forward", "stand"),
+            "toy": TOY._replace(then={"pendulum": ("gymnasium",)}),
+            "cpu": Scale(  # a night on two cores
+                "quick",
+                {"ant": 5, "walker2d": 5},
+                {"policy_lag": 0},
+                methods=("V", "LA"),
+                then={
+                    "ant": ("run:0", "goal:15,0", "goal:0,-15"),
+                    "walker2d": ("forward", "backward", "flip"),
+                },
+                explored=(1.0,),
+            ),
+            "paper": Scale(
+                "paper",
+                dict.fromkeys(MUJOCO_ENVS, 10),
+                then={
+                    "ant": ("run:0", "run:90", "run:180", "run:270", "goal:15,0", "goal:0,-15"),
+                    "walker2d": ("forward", "backward", "flip", "stand"),
+                    "humanoid": ("forward", "stand"),
+                },
+            ),
         },
     ),
     "offline": Study(
@@ -237,6 +250,7 @@ def make(study: str, scale: str, num_seeds: int | None = None) -> list[Cell]:
     chosen = STUDIES[study]
     at = chosen.scales[scale]
     seeds = at.num_seeds if num_seeds is None else dict.fromkeys(at.num_seeds, num_seeds)
+    methods = {name: chosen.methods[name] for name in at.methods or chosen.methods}
     widths = seeds if chosen.together else dict.fromkeys(seeds, 1)
     cells: list[Cell] = []
     for seed in range(max(seeds.values())):
@@ -250,20 +264,20 @@ def make(study: str, scale: str, num_seeds: int | None = None) -> list[Cell]:
             )
             for env in seeds
             if seed in range(0, seeds[env], widths[env])
-            for method, changes in chosen.methods.items()
+            for method, changes in methods.items()
         ]
-        cells += [*explore, *_on_tasks(explore, chosen.then)]
+        cells += [*explore, *_on_tasks(explore, at)]
     return cells
 
 
-def _on_tasks(explore: Sequence[Cell], then: Mapping[str, Sequence[str]]) -> Iterator[Cell]:
+def _on_tasks(explore: Sequence[Cell], scale: Scale) -> Iterator[Cell]:
     """The cells on tasks that start from each cell, and from scratch."""
     for cell in explore:
         config, first = cell.config, cell.method == explore[0].method
-        for task in then.get(config.env, ()):
+        for task in scale.then.get(config.env, ()):
             if first:  # from scratch once, with the settings of the first method
                 yield Cell(SCRATCH, _from_scratch(config, task))
-            for part in EXPLORED:
+            for part in scale.explored:
                 iterations = max(1, round(part * config.budget.num_iterations))
                 own = source.on_task(config, cell.name, task, source_iterations=iterations)
                 yield Cell(cell.method, own, cell)

@@ -60,7 +60,7 @@ def draw(
                 fig3(out / "fig3", scale, num_seeds)
             elif what == "fig5":
                 fig5(out / "fig5", out / "fig4", studies["fig4"])
-            elif protocol.STUDIES[what].then:
+            elif protocol.STUDIES[what].scales[scale].then:
                 on_tasks(out / what, what, studies[what])
             elif protocol.STUDIES[what].relabelled:
                 from_data(out / what, what, scale, studies[what])
