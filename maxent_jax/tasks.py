@@ -18,6 +18,7 @@ from maxent_jax.envs import mjx_backend, mountain_car, pendulum
 from maxent_jax.envs import torso as torsos
 from maxent_jax.envs.base import Env
 from maxent_jax.envs.task import MujocoEnv
+from maxent_jax.precision import in_32_bits
 
 REACH_SCALE = 5.0  # metres, at which the dense reward of a place has fallen to 1/e
 
@@ -71,6 +72,7 @@ def register(name: str, reward: Reward, sparse: bool = False) -> None:
     names.register(name, reward, sparse)
 
 
+@in_32_bits
 def make(name: str, env_name: str, env: Env) -> Task:
     """Makes the task of a name.
 
