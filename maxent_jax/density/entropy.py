@@ -37,10 +37,18 @@ def knn_density(
     """
     distance = knn_distances(queries, points, k, exclude)[:, -1]
     num_points, dims = np.shape(points)
+    return jnp.exp(log_density(distance, num_others(num_points, exclude), k, dims))
+
+
+def num_others(num_points: int, exclude: jax.Array | None) -> jax.Array:
+    """Returns how many of N points can be neighbours of each query, [] or [B] float32.
+
+    Args:
+      num_points: N.
+      exclude: [B] int, the point that a query ignores, -1 for none; None: no query ignores one.
+    """
     others = jnp.asarray(num_points, jnp.float32)
-    if exclude is not None:
-        others = others - (jnp.asarray(exclude) >= 0)
-    return jnp.exp(log_density(distance, others, k, dims))
+    return others if exclude is None else others - (jnp.asarray(exclude) >= 0)
 
 
 def knn_entropy(samples: jax.Array, k: int, count: jax.Array | None = None) -> jax.Array:
