@@ -26,7 +26,7 @@ from maxent_jax.config import Config
 from maxent_jax.config.registry import CORRECTIVE, STARTS
 from maxent_jax.density import histogram, plane, reservoir
 from maxent_jax.envs import base
-from maxent_jax.mixture import Archive, occupancy
+from maxent_jax.mixture import Archive, occupancy, scores
 from maxent_jax.precision import in_32_bits
 from maxent_jax.sac import agent
 from maxent_jax.sac.agent import Agent
@@ -114,8 +114,8 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
         jnp.where(method.from_history, history.points, visited.features[rows]),
         jnp.where(method.from_history, reservoir.count(history), config.mixture.reference_size),
     )
-    scores = occupancy.score(p, visited, reference.points, rows, archive, reference.num_filled)
-    best = occupancy.best(scores, visited)
+    earned = scores.score(p, visited, reference.points, rows, archive, reference.num_filled)
+    best = scores.best(earned, visited)
     replay = learner.replay
     if not p.config.intrinsic.stale_rewards:
         replay = experience.measure_all(p, reference, replay, learner.episodes.starts.obs)
@@ -134,8 +134,8 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
     if p.config.mixture.mixing == "episode":  # otherwise no state belongs to one policy
         metrics |= {
             "best_policy": best,
-            "policy_return": scores.episode_return,
-            "policy_step_reward": scores.step_reward,
+            "policy_return": earned.episode_return,
+            "policy_step_reward": earned.step_reward,
         }
     return state._replace(key=key, learner=learner), metrics
 
