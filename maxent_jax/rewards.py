@@ -100,7 +100,8 @@ def hazan_reward(
 ) -> jax.Array:
     """Returns the gradient of the entropy at each state, log(1/density) - 1, [B] nats.
 
-    By Prop. 1 it is p log R + log(N π^(p/2) / (k Γ(p/2 + 1))) - 1.
+    By Prop. 1 it is p log R + log(N π^(p/2) / (k Γ(p/2 + 1))) - 1. It is inf where a state has
+    fewer than k neighbours.
 
     Args: as `knn_reward`.
     Source: Eq. 10.

@@ -55,8 +55,8 @@ def knn_entropy(samples: jax.Array, k: int, count: jax.Array | None = None) -> j
     """Estimates the differential entropy of the distribution that samples come from.
 
     Args:
-      samples: [N, F]. Each is measured against the others. They must be distinct draws: copies of
-        a sample would be neighbours of the others that do not count as such, and bias the estimate.
+      samples: [N, F]. Each is measured against the others. They must be distinct draws, because
+        copies of a draw bias the estimate.
       k: which neighbour.
       count: [] int32, how many of the samples count, from the first; all of them if None.
     Returns:

@@ -57,7 +57,8 @@ def knn_distances(
         values cannot raise an error: a point that is not finite is never a neighbour, and a query
         that is not finite gets NaN.
     Raises:
-      ValueError: k < 1, k > M, the sizes do not match, or a concrete value is not finite.
+      ValueError: k < 1, k > M or a concrete count, the sizes do not match, or a concrete value is
+        not finite.
       TypeError: the input is not an array of real numbers, or labels are not whole numbers.
     """
     queries, points, k = _floats("queries", queries), _floats("points", points), check_whole("k", k)

@@ -18,7 +18,7 @@ from maxent_jax.errors import ConfigError
 
 
 class PhysicsState(NamedTuple):
-    """All that the next step depends on. The warm start makes every backend a pure function."""
+    """All that the next step depends on; with the warm start, every backend is a pure function."""
 
     qpos: jax.Array  # [..., nq] metres, unit quaternion, radians
     qvel: jax.Array  # [..., nv] metres and radians per second

@@ -228,7 +228,7 @@ def _check(task: Task, model: mujoco.MjModel, end_flipped: bool) -> None:
     if model.na:
         raise ConfigError(
             f"{task.xml.name} has actuators with an internal state (activations), which is not "
-            "supported: use stateless actuators"
+            "supported: use stateless actuators."
         )
     low, high = model.actuator_ctrlrange.T
     if not (low < high).all():
@@ -237,4 +237,4 @@ def _check(task: Task, model: mujoco.MjModel, end_flipped: bool) -> None:
             f"no control range, to which actions are scaled: give it a ctrlrange."
         )
     if end_flipped and task.torso is None:
-        raise ConfigError(f"{task.name} has no floating torso: end_flipped must be False")
+        raise ConfigError(f"{task.name} has no floating torso: end_flipped must be False.")
