@@ -17,6 +17,7 @@ from maxent_jax.envs.torso import Torso
 from maxent_jax.errors import ConfigError, ConfigTypeError
 from maxent_jax.features import make_feature_map
 from maxent_jax.intrinsic import Bonus, Setting
+from maxent_jax.precision import in_32_bits
 from maxent_jax.sac import agent
 from maxent_jax.types import Features
 
@@ -45,6 +46,7 @@ class Components(NamedTuple):
         return rewards.of_distance(distance, own.reward, own.reward_distance, len(self.phi.names))
 
 
+@in_32_bits
 def make(config: Config) -> Components:
     """Returns the components of the config's program; each program makes them once."""
     return _make(config.program())
@@ -135,15 +137,37 @@ def _make_around(config: Config, env: Env, num_dims: int) -> Components:
 
 @functools.lru_cache(maxsize=8)
 def with_task(components: Components, name: str) -> Components:
-    """Returns the components with the task of a name; with `none`, without a task."""
+    """Returns the components with the task of a name; with `none`, without a task.
+
+    Raises:
+      ConfigError: a user's task does not give each transition one reward.
+    """
     if name == task_names.NONE:
         return components._replace(task=None)
     task = tasks.make(name, components.config.env, components.env)
     size = components.config.environment.skill_size
+    if name in task_names.USERS:
+        num_dims = components.sac.observation_size - size
+        _check_reward(name, task.reward, num_dims, components.sac.action_size)
     if size and task.reward:
         task = task._replace(reward=skills.bare_reward(task.reward, size))
     registry.in_use.add(("task", name))
     return components._replace(task=task)
+
+
+def _check_reward(name: str, reward: Any, num_dims: int, num_actions: int) -> None:
+    """Raises ConfigError unless a user's reward maps transitions with any leading axes to [...]."""
+    lead = (3, 2)
+    state, action = (
+        jax.ShapeDtypeStruct((*lead, size), jnp.float32) for size in (num_dims, num_actions)
+    )
+    found = getattr(jax.eval_shape(reward, state, action, state), "shape", None)
+    if found != lead:
+        what = "no array" if found is None else f"an array {list(found)}"
+        raise ConfigError(
+            f"the reward of task {name} is {what} for transitions {list(lead)}, but must have the "
+            f"same shape: one number for each."
+        )
 
 
 def _units(config: Config, entry: Entry, num_features: int) -> jax.Array:

@@ -4,9 +4,10 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from maxent_jax.checks import check_number, check_whole
-from maxent_jax.density.entropy import log_density
+from maxent_jax.density.entropy import log_density, num_others
 from maxent_jax.density.knn import knn_distances, smallest_k
 
 # Logarithmic forms stop falling below this distance (feature units), or a duplicate would be -inf.
@@ -79,6 +80,7 @@ def knn_reward(
       [B] dimensionless; log(1 + R/c) by default, at least 0.
     Raises:
       ValueError: M < k, an unknown form, or a scale that is not positive.
+      TypeError: the scale is not a number, or as `knn_distances`.
     Source: Eq. 7; Liu & Abbeel 2021, Eq. 5. `log1p` departs from both in the 1 +, see
     docs/decisions.md, decision 2.
     """
@@ -87,7 +89,7 @@ def knn_reward(
     if not isinstance(scale, jax.core.Tracer) and not 0 < check_number("scale", scale) < jnp.inf:
         raise ValueError(f"scale is {scale}, but must be a positive number")
     distance = knn_distances(features, reference, num_neighbors, exclude, count)[:, -1]
-    return of_distance(distance, form, scale, jnp.shape(features)[1])
+    return of_distance(distance, form, scale, np.shape(features)[1])
 
 
 def hazan_reward(
@@ -98,7 +100,8 @@ def hazan_reward(
 ) -> jax.Array:
     """Returns the gradient of the entropy at each state, log(1/density) - 1, [B] nats.
 
-    By Prop. 1 it is p log R + log(N π^(p/2) / (k Γ(p/2 + 1))) - 1.
+    By Prop. 1 it is p log R + log(N π^(p/2) / (k Γ(p/2 + 1))) - 1. It is inf where a state has
+    fewer than k neighbours.
 
     Args: as `knn_reward`.
     Source: Eq. 10.
@@ -122,20 +125,20 @@ def renyi_reward(
       alpha: the order, in (0, 1); at 1 the entropy is Shannon's and this form is 0.
     Raises:
       ValueError: M < k, or alpha outside (0, 1).
+      TypeError: alpha is not a number, or as `knn_distances`.
     Source: Yuan et al. 2022 (RISE), whose R^(1 - α) leaves out the exponent p.
     """
-    if not 0 < alpha < 1:
+    if not 0 < check_number("alpha", alpha) < 1:
         raise ValueError(f"alpha is {alpha}, but must lie between 0 and 1")
     return (alpha - 1) * _floored_log_density(features, reference, num_neighbors, exclude)
 
 
 def _floored_log_density(features, reference, num_neighbors, exclude):
     """[B] nats, finite also where a state is in the reference."""
-    num_points = jnp.asarray(reference.shape[0], jnp.float32)
-    if exclude is not None:
-        num_points = num_points - (exclude >= 0)
     distance = knn_distances(features, reference, num_neighbors, exclude)[:, -1]
-    return floored_log_density(distance, num_points, num_neighbors, reference.shape[1])
+    num_points, dims = np.shape(reference)
+    others = num_others(num_points, exclude)
+    return floored_log_density(distance, others, num_neighbors, dims)
 
 
 def floored_log_density(

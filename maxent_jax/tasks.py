@@ -1,8 +1,8 @@
-"""Task rewards: what a run is paid for reaching a state, if it has a task.
+"""Task rewards, for runs that have a task.
 
-A task is a pure function of a transition (observation, action, next observation), so that
-transitions of one task can be paid for another. Only `environment` is not: it is what an
-environment of brax, Playground or the user pays itself. The names are those of
+A task is a pure function of a transition (observation, action, next observation), so transitions
+that were collected for one task can be rewarded for another. The exception is `environment`: the
+reward that an environment of brax, Playground or the user returns itself. The names are those of
 `config.tasks.FAMILIES`.
 """
 
@@ -18,6 +18,7 @@ from maxent_jax.envs import mjx_backend, mountain_car, pendulum
 from maxent_jax.envs import torso as torsos
 from maxent_jax.envs.base import Env
 from maxent_jax.envs.task import MujocoEnv
+from maxent_jax.precision import in_32_bits
 
 REACH_SCALE = 5.0  # metres, at which the dense reward of a place has fallen to 1/e
 
@@ -35,7 +36,7 @@ class Task(NamedTuple):
     """A task of an environment."""
 
     reward: Reward | None  # None: the environment's own
-    sparse: bool  # 0 or 1: an episode with a reward is a success
+    sparse: bool  # the reward is 0 or 1, and an episode with a 1 is a success
 
     def pay(
         self,
@@ -50,7 +51,7 @@ class Task(NamedTuple):
           observation: [..., D] the state left.
           action: [..., A] in [-1, 1].
           next_observation: [..., D] the state reached.
-          own: [...] what the environment itself paid.
+          own: [...] the environment's own reward.
         Returns:
           The rewards [...].
         """
@@ -63,7 +64,7 @@ def register(name: str, reward: Reward, sparse: bool = False) -> None:
     Args:
       name: NAME.
       reward: a pure jax function of transitions, for any leading axes, see Reward.
-      sparse: it is 0 or 1, and an episode with a 1 is a success.
+      sparse: whether the reward is 0 or 1, and an episode with a 1 is a success.
     Raises:
       ConfigError: the name is already in use in this process.
       ConfigTypeError (a ValueError and a TypeError): an argument has the wrong type.
@@ -71,13 +72,14 @@ def register(name: str, reward: Reward, sparse: bool = False) -> None:
     names.register(name, reward, sparse)
 
 
+@in_32_bits
 def make(name: str, env_name: str, env: Env) -> Task:
     """Makes the task of a name.
 
     Args:
       name: as in `config.tasks`.
       env_name: the name of the environment.
-      env: the environment, whose time step and control range count.
+      env: the environment; rewards use its time step and control range.
     Raises:
       ConfigError: the environment has no such task, or it is not registered.
     """

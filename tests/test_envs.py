@@ -177,7 +177,8 @@ def test_an_xml_that_does_not_exist_or_is_none_is_refused(tmp_path):
 
 def test_what_mjx_cannot_load_is_named(tmp_path):
     path = tmp_path / "stiff.xml"
-    path.write_text('<mujoco model="stiff"><option integrator="implicit"/></mujoco>')
+    option = '<option integrator="implicit"/>'
+    path.write_text(CART.format(actuator=MOTOR).replace('"cart">', f'"stiff">{option}'))
     with pytest.raises(ConfigError, match=r"'stiff' .*mjINT_IMPLICIT.*: use backend mujoco"):
         envs.from_xml(path, frame_skip=1, backend="mjx")
 
@@ -186,6 +187,38 @@ def test_actuators_with_a_state_are_refused(tmp_path):
     integrator = '<general joint="rail" dyntype="integrator" ctrlrange="-1 1"/>'
     with pytest.raises(ConfigError, match="activations"):
         envs.from_xml(cart(tmp_path, integrator), frame_skip=1, backend="mujoco")
+
+
+@pytest.mark.parametrize("limits", ["", 'ctrlrange="2 2" ctrllimited="false"'])
+def test_an_actuator_without_a_control_range_is_refused(tmp_path, limits):
+    path = cart(tmp_path, f'{MOTOR}<motor name="weak" joint="rail" {limits}/>')
+    with pytest.raises(ConfigError, match=r"actuator 'weak' of cart\.xml has no control range"):
+        envs.from_xml(path, frame_skip=1)
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "mjx"])
+def test_a_model_that_cannot_move_is_refused(tmp_path, backend):
+    path = tmp_path / "stone.xml"
+    path.write_text('<mujoco><worldbody><geom size="0.1"/></worldbody></mujoco>')
+    with pytest.raises(ConfigError, match=r"stone\.xml has no joints"):
+        envs.from_xml(path, frame_skip=1, backend=backend)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "kind", "says"),
+    [
+        (dict(physics=Options("rk4")), ConfigError, "unknown integrator 'rk4': choose one of Eul"),
+        (dict(physics=Options(solver="newton")), ConfigError, "did you mean 'Newton'"),
+        (dict(physics=Options(substeps=0)), ConfigError, "substeps is 0, but must be at least 1"),
+        (dict(physics=Options(iterations=-1)), ConfigError, "iterations is -1, but must be at lea"),
+        (dict(physics=Options(substeps=1.5)), TypeError, "substeps is 1.5, but must be a whole"),
+        (dict(healthy=3), TypeError, "healthy is 3, but must be a function"),
+        (dict(fast="fast"), TypeError, r"fast is 'fast', but must be an envs\.Options"),
+    ],
+)
+def test_a_wrong_option_of_an_xml_is_refused(tmp_path, arguments, kind, says):
+    with pytest.raises(kind, match=says):
+        envs.from_xml(cart(tmp_path), frame_skip=1, **arguments)
 
 
 def test_an_environment_of_the_users_is_known_by_name(tmp_path):

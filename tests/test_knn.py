@@ -103,6 +103,12 @@ def assert_close(found, expected):
     np.testing.assert_allclose(found, expected, rtol=RELATIVE, atol=0)
 
 
+def test_distances_between_half_precision_states_are_those_of_their_values():
+    queries = np.array([[300.0, -400.0], [1.0, 2.0]], np.float16)
+    points = np.array([[0.0, 0.0], [1.0, 2.5], [-300.0, 0.0]], np.float16)
+    assert_close(knn_distances(queries, points, 3), brute_force(queries, points, 3))
+
+
 def gaussian(rng, num):
     return rng.standard_normal((num, DIMS))
 

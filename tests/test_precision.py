@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from maxent_jax import algorithm, envs, features
+from maxent_jax import algorithm, components, envs, features
 from maxent_jax.config import preset
 from maxent_jax.density import entropy, knn
+from maxent_jax.envs.skills import WithSkill
 
 ROOT = Path(__file__).parent.parent
 RUN = """
@@ -55,6 +56,18 @@ def test_environments_step_in_32_bits(x64, name):
 def test_a_state_has_32_bits(x64):
     state = algorithm.init(preset("smoke", env="pendulum"), jax.random.key(0))
     assert not {str(x.dtype) for x in jax.tree.leaves(state)} & {"float64", "int64"}
+
+
+def test_a_state_has_32_bits_if_its_components_came_first(x64):
+    config = preset("smoke", env="brax:inverted_pendulum", hidden_size=7)  # in no other test
+    components.make(config)
+    state = algorithm.init(config, jax.random.key(0))
+    assert not {str(x.dtype) for x in jax.tree.leaves(state)} & {"float64", "int64"}
+
+
+def test_a_skill_has_32_bits(x64):
+    start = WithSkill(envs.make("pendulum"), 2).reset(jax.random.key(0))
+    assert start.obs.dtype == np.float32
 
 
 @pytest.mark.slow

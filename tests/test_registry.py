@@ -184,6 +184,19 @@ def test_an_environment_that_cannot_be_trained_is_refused(restored_tables, made,
             components.make(preset("smoke", env="user:wrong"))
 
 
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        (dict(low=(-1.0, 2.0), high=(1.0, 2.0)), r"from \(-1.0, 2.0\) to \(1.0, 2.0\), but low"),
+        (dict(bins=(10, 0)), r"bins \(10, 0\), but both must be at least 1"),
+        (dict(coordinates=(-1, 0)), r"coordinates \(-1, 0\), but none may be negative"),
+    ],
+)
+def test_a_grid_without_cells_is_refused(restored_tables, wrong, says):
+    with pytest.raises(ConfigError, match=says):
+        envs.register("wrong", lambda *_: None, envs.DEFAULT_GRID._replace(**wrong))
+
+
 @pytest.mark.parametrize("make", [Pendulum, lambda backend: None, lambda *, backend, physics: None])
 def test_a_function_that_does_not_take_a_backend_and_a_physics_is_refused(restored_tables, make):
     with pytest.raises(ConfigTypeError, match="must take two arguments, the backend and the phys"):

@@ -56,6 +56,16 @@ def test_a_form_is_what_one_computes_by_hand(form, distance, expected):
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)  # a few float32 roundings
 
 
+def test_rewards_take_lists_as_the_search_does():
+    states, others = [[0.0], [2.0], [5.0]], [1, -1, -1]
+    arrays = np.array(states, np.float32), np.array(states, np.float32), 1
+    for reward in (rewards.knn_reward, rewards.hazan_reward):
+        found = reward(states, states, 1, exclude=others)
+        np.testing.assert_array_equal(found, reward(*arrays, exclude=np.array(others)))
+    found = rewards.renyi_reward(states, states, 1, 0.5, others)
+    np.testing.assert_array_equal(found, rewards.renyi_reward(*arrays, 0.5, np.array(others)))
+
+
 def test_the_reward_of_a_state_is_the_form_of_the_distance_to_its_kth_neighbour():
     reference = np.array([[0.0], [1.0], [4.0], [9.0]], np.float32)
     features = np.array([[0.0], [3.0]], np.float32)

@@ -14,7 +14,8 @@ from maxent_jax.config import preset
 from maxent_jax.density import histogram
 from maxent_jax.envs import base
 from maxent_jax.mixture import occupancy
-from maxent_jax.mixture.occupancy import Occupancy, Scores
+from maxent_jax.mixture.occupancy import Occupancy
+from maxent_jax.mixture.scores import Scores, best, score
 from maxent_jax.sac import agent
 
 T = 6
@@ -310,7 +311,7 @@ def test_scores_are_those_by_hand(key, leave_own_out, source, num_policies, snap
     points = found.features[rows]
     if source == "history":  # points that no state of these rollouts is
         points, rows = points + 0.1, jnp.full_like(rows, -1)
-    scores = occupancy.score(bare(config), found, points, rows, archive_of(num_policies))
+    scores = score(bare(config), found, points, rows, archive_of(num_policies))
     expected = expected_scores(found, points, rows, config, num_policies)
     # Sums of up to 60 float32 rewards of order 1.
     np.testing.assert_allclose(scores.episode_return, expected[0], rtol=1e-5)
@@ -323,14 +324,14 @@ def test_a_parked_policy_scores_low_only_among_its_own_states():
     parked = (found.policy == 1)[:, None]
     found = found._replace(features=jnp.where(parked, 100.0, found.features))
     rows = jnp.arange(NUM_STATES, dtype=jnp.int32)
-    best = {}
+    winner = {}
     for leave_own_out in (False, True):
         p = bare(preset("smoke", leave_own_out=leave_own_out))
-        scores = occupancy.score(p, found, found.features, rows, archive_of(2))
-        best[leave_own_out] = int(occupancy.best(scores, found))
+        scores = score(p, found, found.features, rows, archive_of(2))
+        winner[leave_own_out] = int(best(scores, found))
         if not leave_own_out:
             assert scores.step_reward[1] == 0  # its own states lie at distance 0
-    assert best == {False: 0, True: 1}
+    assert winner == {False: 0, True: 1}
 
 
 @pytest.mark.slow
@@ -342,7 +343,7 @@ def test_a_policy_that_made_the_whole_reference_sees_its_own_states(key):
         seen = jnp.concatenate([rows, jnp.arange(num_foreign, dtype=jnp.int32)])
         assert (found.policy[seen] != 2).sum() == num_foreign
         scores = {
-            leave_own_out: occupancy.score(
+            leave_own_out: score(
                 bare(preset("smoke", leave_own_out=leave_own_out)),
                 found,
                 found.features[seen],
@@ -363,10 +364,7 @@ def test_a_policy_without_weight_is_scored_all_the_same(key):
     weightless = found._replace(weight=jnp.where(found.policy == 0, 0.0, found.weight))
     p = bare(preset("smoke"))
     rows = jnp.arange(NUM_STATES, dtype=jnp.int32)
-    scores = [
-        occupancy.score(p, each, found.features, rows, archive_of(3))
-        for each in (found, weightless)
-    ]
+    scores = [score(p, each, found.features, rows, archive_of(3)) for each in (found, weightless)]
     np.testing.assert_array_equal(scores[1].episode_return, scores[0].episode_return)
     assert scores[1].step_reward[0] > 0
 
@@ -383,4 +381,4 @@ def test_a_policy_without_weight_is_scored_all_the_same(key):
 def test_the_best_is_the_highest_that_played(key, returns, players, winner):
     found = hand_made(key)._replace(episode_policy=jnp.array(players, jnp.int32))
     scores = Scores(jnp.array(returns), jnp.zeros(4))
-    assert int(occupancy.best(scores, found)) == winner
+    assert int(best(scores, found)) == winner

@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from maxent_jax import envs, tasks
+from maxent_jax import components, envs, tasks
 from maxent_jax.analysis.gymnasium_play import IDS
-from maxent_jax.config import registry
+from maxent_jax.config import preset, registry
 from maxent_jax.config import tasks as names
 from maxent_jax.errors import ConfigError, ConfigTypeError
 
@@ -202,6 +202,24 @@ def test_a_wrong_name_gives_one_sentence(name, env, sentence):
     with pytest.raises(ConfigError) as wrong:
         names.parse(name, env)
     assert sentence in str(wrong.value)
+
+
+@pytest.mark.parametrize(
+    ("reward", "says"),
+    [
+        (lambda observation, action, after: after[..., :1], r"is an array \[3, 2, 1\] for trans"),
+        (lambda observation, action, after: after[0], r"is an array \[2, 3\] for transitions \[3,"),
+        (lambda observation, action, after: 1.0, r"is an array \[\] for transitions \[3, 2\]"),
+        (lambda observation, action, after: (after[..., 0],), "is no array for transitions"),
+    ],
+)
+@pytest.mark.parametrize("skill_size", [0, 2])
+def test_a_users_task_gives_each_transition_one_reward(reward, says, skill_size):
+    tasks.register("wrong", reward)
+    config = preset("smoke", env="pendulum", task="user:wrong", skill_size=skill_size)
+    with pytest.raises(ConfigError, match=f"the reward of task user:wrong {says}"):
+        components.make(config)
+    names.USERS.pop("user:wrong")
 
 
 def test_a_users_task_is_registered_once_it_is_used():

@@ -194,6 +194,7 @@ FAULTS: tuple[Fault, ...] = (
     of(lambda _: rewards.knn_reward(POINTS, POINTS, 1, form="liner"), ValueError, "'liner'"),
     of(lambda _: rewards.knn_reward(POINTS, POINTS, 1, scale=0), ValueError, "scale is 0"),
     of(lambda _: rewards.renyi_reward(POINTS, POINTS, 1, 2.0), ValueError, "alpha is 2.0"),
+    of(lambda _: rewards.renyi_reward(POINTS, POINTS, 1, "a"), TypeError, "alpha is 'a'"),
     of(lambda _: rewards.hazan_reward(POINTS, POINTS, 9), ValueError, "k is 9"),
     of(
         lambda _: rewards.episodic_bonus(

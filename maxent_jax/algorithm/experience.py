@@ -127,11 +127,7 @@ def sample(
     key_rows, key_variant = jax.random.split(key)
     items: Step = ring.items
     first = replay.draw(ring, shape, key_rows, skip=STEPS_WITHOUT_START * config.budget.num_envs)
-    rows, taken = [first], [jnp.ones(shape, bool)]
-    for _ in range(config.learner.return_steps - 1):
-        following = items.following[rows[-1]]
-        taken.append(taken[-1] & (following >= 0))
-        rows.append(jnp.where(taken[-1], following, rows[-1]))
+    rows, taken = _successors(items, first, config.learner.return_steps)
     last, steps = rows[-1], jnp.stack(rows, axis=-1)
 
     in_ring, row, start = _address(items.previous[first])
@@ -166,6 +162,21 @@ def sample(
         ),
         row=first,
     )
+
+
+def _successors(
+    items: Step, first: jax.Array, num_steps: int
+) -> tuple[list[jax.Array], list[jax.Array]]:
+    """The rows of n consecutive steps of an episode, and whether each exists; n arrays [...] each.
+
+    After the episode's last step, its row is repeated.
+    """
+    rows, taken = [first], [jnp.ones(first.shape, bool)]
+    for _ in range(num_steps - 1):
+        following = items.following[rows[-1]]
+        taken.append(taken[-1] & (following >= 0))
+        rows.append(jnp.where(taken[-1], following, rows[-1]))
+    return rows, taken
 
 
 def measure_all(

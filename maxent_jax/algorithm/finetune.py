@@ -35,8 +35,9 @@ class Start(NamedTuple):
 def start(config: Config, archive: Archive) -> tuple[State, Start]:
     """Returns the first state of a run that starts from an archive, as `downstream` says.
 
-    With best, mixture and both, each policy first plays `first_episodes` episodes. They count as
-    env steps of the run.
+    With best, mixture and both, each policy first plays `first_episodes` episodes. Some play more
+    if the episodes cannot be divided evenly into groups of `num_envs`. All of them count as env
+    steps of the run.
 
     Args:
       config: the run's; its networks are those of the archive's policies.

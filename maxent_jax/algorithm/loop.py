@@ -26,7 +26,7 @@ from maxent_jax.config import Config
 from maxent_jax.config.registry import CORRECTIVE, STARTS
 from maxent_jax.density import histogram, plane, reservoir
 from maxent_jax.envs import base
-from maxent_jax.mixture import Archive, occupancy
+from maxent_jax.mixture import Archive, occupancy, scores
 from maxent_jax.precision import in_32_bits
 from maxent_jax.sac import agent
 from maxent_jax.sac.agent import Agent
@@ -114,10 +114,10 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
         jnp.where(method.from_history, history.points, visited.features[rows]),
         jnp.where(method.from_history, reservoir.count(history), config.mixture.reference_size),
     )
-    scores = occupancy.score(p, visited, reference.points, rows, archive, reference.num_filled)
-    best = occupancy.best(scores, visited)
+    earned = scores.score(p, visited, reference.points, rows, archive, reference.num_filled)
+    best = scores.best(earned, visited)
     replay = learner.replay
-    if not p.config.intrinsic.stale_rewards:
+    if not config.intrinsic.stale_rewards:
         replay = experience.measure_all(p, reference, replay, learner.episodes.starts.obs)
     learner = learner._replace(
         agent=_start(p, method, archive, learner.agent, best, key_scratch),
@@ -131,11 +131,11 @@ def begin(config: Config, state: State) -> tuple[State, Metrics]:
         "num_rollout_steps": jnp.sum(visited.alive, dtype=jnp.int32),
         "num_rollout_invalid": visited.num_invalid,
     }
-    if p.config.mixture.mixing == "episode":  # otherwise no state belongs to one policy
+    if config.mixture.mixing == "episode":  # otherwise no state belongs to one policy
         metrics |= {
             "best_policy": best,
-            "policy_return": scores.episode_return,
-            "policy_step_reward": scores.step_reward,
+            "policy_return": earned.episode_return,
+            "policy_step_reward": earned.step_reward,
         }
     return state._replace(key=key, learner=learner), metrics
 
@@ -147,7 +147,6 @@ def train_segment(config: Config, state: State) -> tuple[State, Metrics]:
     Archives a snapshot of the agent afterwards, if one is due.
     """
     p = components.make(config)
-
     key, key_steps = jax.random.split(state.key)
     keys = jax.random.split(key_steps, config.vector_steps)
     learner, metrics = training.steps(p, state.method, state.learner, keys)
@@ -176,11 +175,11 @@ def end(config: Config, state: State) -> tuple[State, Metrics]:
     def roll_out(weights, key_starts, key_rollout):
         pool = base.only_starts(learner.episodes)
         starts = base.draw_starts(pool, config.mixture.mixture_episodes, key_starts)
-        deterministic = p.config.evaluation.deterministic
+        deterministic = config.evaluation.deterministic
         return occupancy.of_mixture(p, archive, weights, starts, key_rollout, True, deterministic)
 
-    if p.config.mixture.weights == CORRECTIVE:
-        # Fitted to the episodes that are measured, the weights would look better than they are.
+    if config.mixture.weights == CORRECTIVE:
+        # Weights fitted to the episodes that are measured would look better than they are.
         fitted_to = roll_out(weights, *jax.random.split(jax.random.key(EVALUATION_SEED + 1)))
         _, weights = occupancy.corrected(p, fitted_to, weights)
     visited = roll_out(weights, key_starts, key_rollout)
@@ -249,10 +248,10 @@ def compiled(config: Config, jitted: Programs) -> Programs:
 
 def functions(config: Config, seed_axis: bool) -> Programs:
     """Returns the three functions of an iteration, not jitted; mapped over seeds if asked."""
-    parts_of_it = (functools.partial(f, config) for f in (begin, train_segment, end))
+    of_config = (functools.partial(f, config) for f in (begin, train_segment, end))
     if not seed_axis:
-        return Programs(*parts_of_it)
-    return Programs(*(jax.vmap(f, (SEED_AXES,), (SEED_AXES, 0)) for f in parts_of_it))
+        return Programs(*of_config)
+    return Programs(*(jax.vmap(f, (SEED_AXES,), (SEED_AXES, 0)) for f in of_config))
 
 
 def reduce_metrics(metrics: Metrics) -> Metrics:

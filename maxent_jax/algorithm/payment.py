@@ -1,4 +1,4 @@
-"""What SAC is paid for the steps that it draws: the intrinsic reward, or a bonus; and a task's."""
+"""The rewards of the steps that SAC learns from: r_t or a bonus, plus a task's reward."""
 
 from typing import Any
 
@@ -124,8 +124,6 @@ def pay_bonus(
     components: Components, learner: Learner, drawn: Experience, key: jax.Array
 ) -> tuple[Any, jax.Array, Metrics]:
     """Returns the bonus after learning from the draw, its reward [updates, B, 1], and metrics."""
-    # Unless it has a scale, its reward is divided by the standard deviation over the draw: SAC's
-    # temperature needs one.
     payer = components.bonus
     assert payer is not None
     key_value, key_learn = jax.random.split(key)
@@ -145,6 +143,7 @@ def pay_bonus(
     together = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps)
     bonus, found = payer.reward(learner.bonus, together)
     size = jnp.std(found)
+    # SAC's temperature needs rewards of a fixed scale.
     unit = 1.0 if payer.has_scale else jnp.maximum(size, SMALLEST_SIZE)
     paid = components.config.intrinsic.reward_scale * found / unit
 

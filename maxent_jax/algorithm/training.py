@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from maxent_jax.algorithm import experience, payment
-from maxent_jax.algorithm.experience import Reference
+from maxent_jax.algorithm.experience import Reference, Step
 from maxent_jax.algorithm.learner import Learner, visit, visit_plane
 from maxent_jax.algorithm.methods import Method
 from maxent_jax.components import Components
@@ -103,7 +103,7 @@ def _step_beside(
     drawn: Experience,
     keys: _Keys,
 ) -> tuple[Learner, Metrics]:
-    """Steps all envs once; beside it, takes the gradient steps, if the draw holds anything."""
+    """Steps all envs once, and takes the gradient steps beside it unless the draw is empty."""
     length = components.config.environment.episode_length
     learner = _with_cells_filled(components, learner)
 
@@ -162,7 +162,10 @@ def _record(
     everyone: Transition,
     keys: _Keys,
 ) -> tuple[Learner, Metrics]:
-    """Adds the transitions of a vector step to all that remembers them."""
+    """Adds the transitions of a vector step to the replay, the history, the memory and the counts.
+
+    The reference is refreshed if it is due.
+    """
     config = components.config
     taken = base.steps_taken(learner.episodes)[: config.budget.num_envs]
     transition = jax.tree.map(lambda x: x[: config.budget.num_envs], everyone)
@@ -194,22 +197,28 @@ def _record(
         env_steps=learner.env_steps + config.budget.num_envs,
         plane=visit_plane(components, learner.plane, transition.next_observation, transition.valid),
     )
+    metrics = _step_metrics(components, ring.items, rows, transition)
+    return learner, metrics | {"num_invalid": jnp.sum(~everyone.valid, dtype=jnp.int32)}
+
+
+def _step_metrics(
+    components: Components, items: Step, rows: jax.Array, transition: Transition
+) -> Metrics:
+    """Metrics of the transitions [N, ...] that the replay has just stored in `rows` [N]."""
     metrics: Metrics = {}
     if components.torso is not None:
         flipped = components.torso.flipped(transition.next_observation)
         metrics["flipped_share"] = jnp.mean(flipped.astype(jnp.float32))
-    reached = ring.items.distances.reached.at[rows, 0].get(mode="fill", fill_value=1.0)
+    reached = items.distances.reached.at[rows, 0].get(mode="fill", fill_value=1.0)
     num_valid = jnp.maximum(jnp.sum(transition.valid), 1)
-    if ring.items.task is not None:
-        earned = ring.items.task.at[rows, 0].get(mode="fill", fill_value=0.0)
+    if items.task is not None:
+        earned = items.task.at[rows, 0].get(mode="fill", fill_value=0.0)
         metrics["task_step_reward"] = jnp.sum(earned * transition.valid) / num_valid
-    metrics |= {
+    return metrics | {
         "step_reward": jnp.sum(components.unshaped_reward(reached) * transition.valid) / num_valid,
         "num_deaths": jnp.sum(transition.terminated, dtype=jnp.int32),
         "num_time_limits": jnp.sum(transition.truncated, dtype=jnp.int32),
-        "num_invalid": jnp.sum(~everyone.valid, dtype=jnp.int32),
     }
-    return learner, metrics
 
 
 def _refreshed(

@@ -21,7 +21,8 @@ from maxent_jax.config import Config, tasks
 from maxent_jax.config.registry import CORRECTIVE
 from maxent_jax.density import histogram
 from maxent_jax.mixture import Archive, occupancy
-from maxent_jax.mixture.occupancy import Occupancy, Scores
+from maxent_jax.mixture.occupancy import Occupancy
+from maxent_jax.mixture.scores import Scores, score
 from maxent_jax.precision import in_32_bits
 from maxent_jax.runs import checkpoint, files, integrity, memory
 from maxent_jax.sac import agent
@@ -340,7 +341,7 @@ def _act(
 
 _of_mixture = jax.jit(occupancy.of_mixture, static_argnums=(0, 5, 6))
 _of_episodes = jax.jit(occupancy.of_episodes, static_argnums=0)
-_score = jax.jit(occupancy.score, static_argnums=0)
+_score = jax.jit(score, static_argnums=0)
 
 
 def paths(visited: Occupancy) -> Paths:

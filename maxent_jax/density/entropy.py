@@ -37,18 +37,26 @@ def knn_density(
     """
     distance = knn_distances(queries, points, k, exclude)[:, -1]
     num_points, dims = np.shape(points)
+    return jnp.exp(log_density(distance, num_others(num_points, exclude), k, dims))
+
+
+def num_others(num_points: int, exclude: jax.Array | None) -> jax.Array:
+    """Returns how many of N points can be neighbours of each query, [] or [B] float32.
+
+    Args:
+      num_points: N.
+      exclude: [B] int, the point that a query ignores, -1 for none; None: no query ignores one.
+    """
     others = jnp.asarray(num_points, jnp.float32)
-    if exclude is not None:
-        others = others - (jnp.asarray(exclude) >= 0)
-    return jnp.exp(log_density(distance, others, k, dims))
+    return others if exclude is None else others - (jnp.asarray(exclude) >= 0)
 
 
 def knn_entropy(samples: jax.Array, k: int, count: jax.Array | None = None) -> jax.Array:
     """Estimates the differential entropy of the distribution that samples come from.
 
     Args:
-      samples: [N, F]. Each is measured against the others. They must be distinct draws: copies of
-        a sample would be neighbours of the others that do not count as such, and bias the estimate.
+      samples: [N, F]. Each is measured against the others. They must be distinct draws, because
+        copies of a draw bias the estimate.
       k: which neighbour.
       count: [] int32, how many of the samples count, from the first; all of them if None.
     Returns:

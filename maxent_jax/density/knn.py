@@ -45,8 +45,8 @@ def knn_distances(
     Works inside jit, scan and vmap; is not differentiable. Memory grows with B + M, not with B × M.
 
     Args:
-      queries: [B, F] float32; other floats are slower.
-      points: [M, F], same units and dtype.
+      queries: [B, F]. float64 is slower than float32; float16 is converted to float32.
+      points: [M, F], same units.
       k: the number of neighbours.
       exclude: [B] int, the label of the points that a query ignores, -1 for none. A query that is
         itself a point ignores itself by its label, even where other points share its place.
@@ -57,13 +57,15 @@ def knn_distances(
         values cannot raise an error: a point that is not finite is never a neighbour, and a query
         that is not finite gets NaN.
     Raises:
-      ValueError: k < 1, k > M, the sizes do not match, or a concrete value is not finite.
+      ValueError: k < 1, k > M or a concrete count, the sizes do not match, or a concrete value is
+        not finite.
       TypeError: the input is not an array of real numbers, or labels are not whole numbers.
     """
     queries, points, k = _floats("queries", queries), _floats("points", points), check_whole("k", k)
     _check(queries, points, k, count)
     queries, points = jnp.asarray(queries), jnp.asarray(points)
-    dtype = jnp.promote_types(queries.dtype, points.dtype)
+    # At least 32 bits: the square of a distance above 256 overflows float16.
+    dtype = jnp.promote_types(jnp.promote_types(queries.dtype, points.dtype), jnp.float32)
     queries, points = queries.astype(dtype), points.astype(dtype)
     num_queries, num_points = queries.shape[0], points.shape[0]
     if exclude is None:

@@ -101,28 +101,21 @@ def register(
         1 m². If the default feature map keeps these coordinates, bonuses see them in eighths of the
         grid's sides.
     Raises:
-      ConfigError: the name is already in use in this process.
+      ConfigError: the name is already in use in this process, or the grid has no cells.
       ConfigTypeError (a ValueError and a TypeError): an argument has the wrong type or form.
     """
     registry.check_name("environment", name)
-    for wrong, sentence in (
-        (not callable(make), f"make is {make!r}, but must be a function that makes a brax Env."),
-        (
-            callable(make) and not _takes_two(make),
-            f"make is {make!r}, but must take two arguments, the backend and the physics.",
-        ),
-        (not isinstance(grid, Grid), f"grid is {grid!r}, but must be a density.histogram.Grid."),
-        (
-            phi is not None and not (callable(phi) and hasattr(phi, "names")),
-            f"phi is {phi!r}, but must be a function with `names`.",
-        ),
-        (
-            not isinstance(in_metres, bool),
-            f"in_metres is {in_metres!r}, but must be True or False.",
-        ),
-    ):
-        if wrong:
-            raise ConfigTypeError(sentence)
+    if not callable(make):
+        raise ConfigTypeError(f"make is {make!r}, but must be a function that makes a brax Env.")
+    if not _takes_two(make):
+        raise ConfigTypeError(
+            f"make is {make!r}, but must take two arguments, the backend and the physics."
+        )
+    _check_grid(grid)
+    if phi is not None and not (callable(phi) and hasattr(phi, "names")):
+        raise ConfigTypeError(f"phi is {phi!r}, but must be a function with `names`.")
+    if not isinstance(in_metres, bool):
+        raise ConfigTypeError(f"in_metres is {in_metres!r}, but must be True or False.")
     registry.register_environment(name, Entry(make, grid, None, phi), in_metres)
 
 
@@ -147,8 +140,8 @@ def from_xml(
         that are not finite end it.
       fast: the options of the profile `fast`; by default there is no such profile.
     Raises:
-      ConfigError: MuJoCo cannot read the file, the backend cannot simulate it, or there is no such
-        profile.
+      ConfigError: MuJoCo cannot read the file, nothing in it can move, an actuator has no control
+        range, the backend cannot simulate it, or there is no such profile.
       TypeError: an argument has the wrong type.
     """
     path = check_path("xml", xml)
@@ -156,6 +149,10 @@ def from_xml(
         raise ConfigError(f"frame_skip is {frame_skip}, but must be at least 1.")
     if not 0 <= check_number("reset_noise", reset_noise) < float("inf"):
         raise ConfigError(f"reset_noise is {reset_noise}, but must be 0 or more.")
+    if not (healthy is None or callable(healthy)):
+        raise ConfigTypeError(f"healthy is {healthy!r}, but must be a function of observations.")
+    if not isinstance(fast, Options):
+        raise ConfigTypeError(f"fast is {fast!r}, but must be an envs.Options.")
     task = Task(
         name=path.stem,
         xml=path,
@@ -178,6 +175,19 @@ def _takes_two(make: Callable) -> bool:
     except ValueError:  # of a builtin without a signature
         return True
     return True
+
+
+def _check_grid(grid: Grid) -> None:
+    if not isinstance(grid, Grid):
+        raise ConfigTypeError(f"grid is {grid!r}, but must be a density.histogram.Grid.")
+    if not all(low < high for low, high in zip(grid.low, grid.high, strict=True)):
+        raise ConfigError(
+            f"the grid is from {grid.low} to {grid.high}, but low must be below high."
+        )
+    if min(grid.bins) < 1:
+        raise ConfigError(f"the grid has bins {grid.bins}, but both must be at least 1.")
+    if min(grid.coordinates) < 0:
+        raise ConfigError(f"the grid has coordinates {grid.coordinates}, but none may be negative.")
 
 
 def _qpos_and_qvel(state: PhysicsState, _) -> Any:

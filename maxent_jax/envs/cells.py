@@ -14,7 +14,7 @@ import jax.numpy as jnp
 class Cells(NamedTuple):
     """Q cells. Those with visits have a state; `base.Episodes` holds it in its pool of starts."""
 
-    share: jax.Array  # [N] of the episodes that begin at a cell; if it is 0, they visit none either
+    share: jax.Array  # [N] of the episodes that begin at a cell; those with 0 are not counted
     age: jax.Array  # [Q] int32, of the state's episode there
     visits: jax.Array  # [Q] int32, steps that left a state in the cell
 
@@ -33,8 +33,8 @@ def visit(cells: Cells, cell: jax.Array, age: jax.Array) -> tuple[Cells, jax.Arr
       cell: [N] int32, the cell of each episode; Q for a state off the grid.
       age: [N] int32 of the episodes.
     Returns:
-      The cells after it, and [N] int32 the cell that has none but the episode's state; Q if there
-      is no such cell.
+      The cells after the visit, and [N] int32 the cell whose first state is this episode's; Q for
+      an episode that is not the first in its cell.
     """
     num_cells, rows = cells.age.shape[0], jnp.arange(cell.shape[0], dtype=jnp.int32)
     cell = jnp.where(cells.share > 0, cell, num_cells)
@@ -57,8 +57,8 @@ def draw(cells: Cells, num: int, key: jax.Array) -> tuple[jax.Array, jax.Array]:
       num: of draws, independent of each other.
       key: of the draw.
     Returns:
-      [num] int32 the cells, and [num] bool whether each has a state: not if none has, and
-      otherwise hardly ever, by rounding.
+      [num] int32 the cells, and [num] bool whether each has a state. All are false if no cell has
+      one; otherwise one is false only by a rare rounding error.
     """
     weights = jnp.where(cells.visits > 0, 1.0 / jnp.maximum(cells.visits, 1), 0.0)
     cell = jax.random.choice(key, weights.shape[0], (num,), p=weights)

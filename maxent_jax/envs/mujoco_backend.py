@@ -1,15 +1,13 @@
-"""C MuJoCo on all cores.
+"""C MuJoCo on all cores, called from XLA.
 
 On a CPU, XLA calls it through the native library. Without that library, or on another device, a
-callback calls its Python bindings. Both give the same numbers.
+callback calls its Python bindings (mujoco_bindings.py). Both give the same numbers.
 """
 
 import copy
 import ctypes
 import hashlib
 import itertools
-import os
-import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -19,16 +17,13 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import batch
 
 from maxent_jax import native
+from maxent_jax.envs import mujoco_bindings
 from maxent_jax.envs.physics import Derived, Physics, PhysicsState, StepBeside, Work
 
-CORES = os.cpu_count() or 1
-STATE = ("qpos", "qvel", "qacc_warmstart")  # of a PhysicsState, by their names in MjData
 # Of C MuJoCo, in the order that maxent_add_model expects.
 FUNCTIONS = ("mj_makeData", "mj_step", "mj_forward", "mj_rnePostConstraint")
-Rows = list[np.ndarray]  # [B, ...] each
 Simulate = Callable[[PhysicsState, jax.Array], tuple[PhysicsState, Derived]]
 
 
@@ -163,7 +158,7 @@ def halves_through_xla(
 def through_python(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Simulate:
     """Returns the simulation by Python's bindings in a callback, for any device."""
     sizes = _sizes(model, derived)
-    rows = _rows(model, num_substeps, derived)
+    rows = mujoco_bindings.simulator(model, num_substeps, derived)
 
     def simulate(state: PhysicsState, control: jax.Array) -> tuple[PhysicsState, Derived]:
         shapes = _shapes(state, control, sizes.values())
@@ -178,7 +173,7 @@ def halves_through_python(
 ) -> Halves:
     """Returns the simulation by Python's bindings in two halves, for any device."""
     sizes = _sizes(model, derived)
-    rows = _rows(model, num_substeps, derived)
+    rows = mujoco_bindings.simulator(model, num_substeps, derived)
     pool = ThreadPoolExecutor(1)
     started: dict[int, Future] = {}
     tickets = itertools.count(1)
@@ -211,22 +206,6 @@ def halves_through_python(
         return PhysicsState(*found[:3]), dict(zip(derived, found[3:], strict=True))
 
     return Halves(start, finish)
-
-
-def _rows(model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]) -> Callable:
-    """The simulation of numpy arrays with any leading axes, by Python's bindings."""
-    simulator: Callable[[Rows], Rows] = (
-        _Threads(model, num_substeps, derived) if derived else _Batches(model, num_substeps)
-    )
-
-    def rows(*arrays):
-        flat = [np.asarray(x).reshape(-1, x.shape[-1]) for x in arrays]
-        lead = arrays[0].shape[:-1]
-        # A diverging simulation becomes inf; base.step ends its episode.
-        with np.errstate(over="ignore"):
-            return [x.reshape(*lead, -1).astype(np.float32) for x in simulator(flat)]
-
-    return rows
 
 
 def _shapes(
@@ -281,69 +260,3 @@ def _add(model: mujoco.MjModel, derived: tuple[str, ...]) -> str | None:
         return None
     _added[name] = model
     return name
-
-
-class _Batches:
-    """mujoco.batch: steps whole batches, without Python between their rows.
-
-    A pure function of its arguments: it keeps only scratch space.
-    """
-
-    def __init__(self, model: mujoco.MjModel, num_substeps: int):
-        self._model, self._num_substeps = model, num_substeps
-        self._batches: dict[int, batch.Batch] = {}
-        self._lock = threading.Lock()
-
-    def __call__(self, rows: Rows) -> Rows:
-        with self._lock:
-            simulations = self._batch(len(rows[0]))
-            for name, values in zip((*STATE, "ctrl"), rows, strict=True):
-                simulations.bind(name)[:] = values
-            simulations.bind("time")[:] = 0
-            simulations.step(nstep=self._num_substeps)
-            return [simulations.bind(name).copy() for name in STATE]
-
-    def _batch(self, rows: int) -> batch.Batch:
-        if rows not in self._batches:
-            self._batches[rows] = batch.Batch(self._model, rows, CORES)
-        return self._batches[rows]
-
-
-class _Threads:
-    """Steps row by row, with one MjData for each core.
-
-    The derived fields are those after mj_step and, as in Gymnasium, mj_rnePostConstraint, which no
-    batched call of MuJoCo makes. With 0 substeps the state is evaluated, not stepped, and external
-    forces are 0.
-    """
-
-    def __init__(self, model: mujoco.MjModel, num_substeps: int, derived: tuple[str, ...]):
-        self._model, self._num_substeps, self._derived = model, num_substeps, derived
-        self._data = [mujoco.MjData(model) for _ in range(CORES)]
-        self._pool = ThreadPoolExecutor(CORES)
-        self._lock = threading.Lock()
-
-    def __call__(self, rows: Rows) -> Rows:
-        count = len(rows[0])
-        names = (*STATE, *self._derived)
-        found = [np.empty((count, getattr(self._data[0], name).size)) for name in names]
-        parts = np.array_split(np.arange(count), CORES)
-        with self._lock:
-            list(self._pool.map(lambda d, part: self._run(d, part, rows, found), self._data, parts))
-        return found
-
-    def _run(self, data: mujoco.MjData, part: Sequence[int], rows: Rows, found: Rows) -> None:
-        inputs = [getattr(data, name) for name in (*STATE, "ctrl")]
-        outputs = [getattr(data, name).ravel() for name in (*STATE, *self._derived)]
-        for row in part:
-            data.time = 0
-            for field, values in zip(inputs, rows, strict=True):
-                field[:] = values[row]
-            if self._num_substeps:
-                mujoco.mj_step(self._model, data, self._num_substeps)
-                mujoco.mj_rnePostConstraint(self._model, data)
-            else:
-                data.cfrc_ext[:] = 0
-                mujoco.mj_forward(self._model, data)
-            for field, values in zip(outputs, found, strict=True):
-                values[row] = field

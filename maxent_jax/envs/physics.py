@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 import jax
 import mujoco
 
+from maxent_jax.checks import check_choice, check_whole
 from maxent_jax.errors import ConfigError
 
 
 class PhysicsState(NamedTuple):
-    """All that the next step depends on. The warm start makes every backend a pure function."""
+    """All that the next step depends on; with the warm start, every backend is a pure function."""
 
     qpos: jax.Array  # [..., nq] metres, unit quaternion, radians
     qvel: jax.Array  # [..., nv] metres and radians per second
@@ -102,8 +103,10 @@ def load_model(xml: Path, options: Options = REFERENCE) -> mujoco.MjModel:
     """Loads the MuJoCo model of a file, with changed options.
 
     Raises:
-      ConfigError: MuJoCo cannot read the file.
+      ConfigError: MuJoCo cannot read the file, or an option has an invalid value.
+      TypeError: an option has the wrong type.
     """
+    _check_options(options)
     keep_no_log()
     try:
         spec = mujoco.MjSpec.from_file(str(xml))
@@ -133,6 +136,16 @@ def load_model(xml: Path, options: Options = REFERENCE) -> mujoco.MjModel:
     # A diverging simulation must be noticed: MuJoCo would silently reset it to its rest pose.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     return model
+
+
+def _check_options(options: Options) -> None:
+    for name, known in (("integrator", _INTEGRATORS), ("solver", _SOLVERS)):
+        if getattr(options, name) is not None:
+            check_choice(name, getattr(options, name), known)
+    for name in ("substeps", "iterations", "ls_iterations", "max_contacts"):
+        value = getattr(options, name)
+        if value is not None and check_whole(name, value) < 1:
+            raise ConfigError(f"{name} is {value}, but must be at least 1.")
 
 
 def _unreadable(xml: Path, error: ValueError) -> str:

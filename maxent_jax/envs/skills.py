@@ -14,6 +14,7 @@ from brax.envs.base import Env, State, Wrapper
 
 from maxent_jax.density.histogram import Grid
 from maxent_jax.envs.physics import Work
+from maxent_jax.precision import in_32_bits
 from maxent_jax.types import Features
 
 
@@ -25,6 +26,7 @@ class WithSkill(Wrapper):
         super().__init__(env)
         self._size = size
 
+    @in_32_bits
     def reset(self, rng: jax.Array) -> State:
         """Draws a start, and a skill uniformly from the unit sphere."""
         key_start, key_skill = jax.random.split(rng)

@@ -223,10 +223,18 @@ def _options(task: Task, profile: str | Options) -> Options:
 
 
 def _check(task: Task, model: mujoco.MjModel, end_flipped: bool) -> None:
+    if not model.nv:
+        raise ConfigError(f"{task.xml.name} has no joints, so nothing can move: add a joint.")
     if model.na:
         raise ConfigError(
             f"{task.xml.name} has actuators with an internal state (activations), which is not "
-            "supported: use stateless actuators"
+            "supported: use stateless actuators."
+        )
+    low, high = model.actuator_ctrlrange.T
+    if not (low < high).all():
+        raise ConfigError(
+            f"actuator '{model.actuator(int((low >= high).argmax())).name}' of {task.xml.name} has "
+            f"no control range, to which actions are scaled: give it a ctrlrange."
         )
     if end_flipped and task.torso is None:
-        raise ConfigError(f"{task.name} has no floating torso: end_flipped must be False")
+        raise ConfigError(f"{task.name} has no floating torso: end_flipped must be False.")

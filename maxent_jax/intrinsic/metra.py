@@ -57,7 +57,7 @@ class State(NamedTuple):
 
 
 def make(setting: Setting) -> Bonus:
-    """Makes the bonus (φ(s') - φ(s))·z, of either sign and a scale of its own."""
+    """Makes the bonus (φ(s') - φ(s))·z, of either sign; it is not divided by its deviation."""
     metra = build(setting)
     return Bonus(
         init=functools.partial(init, metra),

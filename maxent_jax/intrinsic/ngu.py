@@ -104,7 +104,7 @@ def init(ngu: Ngu, key: jax.Array) -> State:
 
 
 def embed(ngu: Ngu, state: State, features: jax.Array) -> jax.Array:
-    """Embeds states, [N, D] -> [N, F]."""
+    """Embeds features, [N, F] -> [N, E]."""
     return _embedding(ngu, state.controllable.parameters, features)
 
 
@@ -118,8 +118,8 @@ def novelty(
     as in Algorithm 1.
 
     Args:
-      embedding: [N, F].
-      earlier: [N, T, F] of the episode's earlier states; the first `count` are filled.
+      embedding: [N, E].
+      earlier: [N, T, E] of the episode's earlier states; the first `count` are filled.
       count: [N] int.
     Returns:
       The state, and the novelty [N].

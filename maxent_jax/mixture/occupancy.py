@@ -1,4 +1,4 @@
-"""The states that a mixture visits: rolls them out, weighs them, and scores the policies."""
+"""The states that a mixture visits: rolls them out, weighs them, and measures them."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,6 @@ from maxent_jax import mixture, rollout
 from maxent_jax.components import Components
 from maxent_jax.config.registry import CORRECTIVE
 from maxent_jax.density import entropy, histogram, plane
-from maxent_jax.density.knn import NONE_EXCLUDED, knn_distances
 from maxent_jax.envs.base import State
 from maxent_jax.mixture import Archive
 from maxent_jax.rollout import Trajectories
@@ -35,13 +34,6 @@ class Occupancy(NamedTuple):
         return self.episode_policy.shape[0]
 
 
-class Scores(NamedTuple):
-    """What each archived policy earns under r_t, unshaped; 0 for an empty slot."""
-
-    episode_return: jax.Array  # [P] undiscounted, mean over the policy's episodes
-    step_reward: jax.Array  # [P] mean over the policy's states
-
-
 def of_mixture(
     components: Components,
     archive: Archive,
@@ -56,7 +48,8 @@ def of_mixture(
     By default the policies play equal numbers of episodes (they differ by at most one), and the
     states of a policy share its weight. Health termination ends episodes early, so a pooled sample
     would give long-lived policies more weight. With `pooled`, policies are drawn by weight and all
-    states count the same; so do they where the config draws a policy by weight at each step.
+    states count the same. With `mixing` step, a policy is drawn by weight at each step, and all
+    states count the same too.
 
     Args:
       weights: [P] of the policies.
@@ -67,23 +60,23 @@ def of_mixture(
       The occupancy, R = T·E states.
     """
     key_assign, key_act = jax.random.split(key)
-    num_episodes = starts.done.shape[0]
-    if components.config.mixture.mixing == "step":
+    own, num_episodes = components.config.mixture, starts.done.shape[0]
+    if own.mixing == "step":
         act = _act_by_any(components, archive, weights, deterministic)
         reached = _play(components, act, starts, key_act)
-        nobody = jnp.zeros(num_episodes, jnp.int32)
-        found = of_episodes(components, weights, nobody, *_visited(reached), alike=True)
-        return found._replace(task_return=task_returns(components, starts, reached))
-    if components.config.mixture.pooled:
-        plays, offset = weights, jax.random.uniform(key_assign)
+        episode_policy = jnp.zeros(num_episodes, jnp.int32)  # no episode belongs to one policy
     else:
-        slots = jnp.arange(weights.shape[0])
-        chosen = weights > 0 if only_weighted else slots < archive.size
-        plays, offset = chosen / jnp.sum(chosen), jnp.asarray(0.5)
-    episode_policy = mixture.assign_episodes(plays, num_episodes, offset)
-    reached = play(components, archive, episode_policy, starts, key_act, deterministic)
-    pooled = components.config.mixture.pooled
-    found = of_episodes(components, weights, episode_policy, *_visited(reached), alike=pooled)
+        if own.pooled:
+            plays, offset = weights, jax.random.uniform(key_assign)
+        else:
+            slots = jnp.arange(weights.shape[0])
+            chosen = weights > 0 if only_weighted else slots < archive.size
+            plays, offset = chosen / jnp.sum(chosen), jnp.asarray(0.5)
+        episode_policy = mixture.assign_episodes(plays, num_episodes, offset)
+        reached = play(components, archive, episode_policy, starts, key_act, deterministic)
+    alike = own.pooled or own.mixing == "step"
+    played = reached.states, reached.alive, reached.num_invalid
+    found = of_episodes(components, weights, episode_policy, *played, alike)
     return found._replace(task_return=task_returns(components, starts, reached))
 
 
@@ -203,66 +196,6 @@ def _play(components, act, starts, key):
     return rollout.episodes(
         components.env, starts, act, components.config.environment.episode_length, key
     )
-
-
-def _visited(reached: Trajectories) -> tuple[jax.Array, jax.Array, jax.Array]:
-    return reached.states, reached.alive, reached.num_invalid
-
-
-def score(
-    components: Components,
-    occupancy: Occupancy,
-    points: jax.Array,
-    rows: jax.Array,
-    archive: Archive,
-    num_filled: jax.Array | None = None,
-) -> Scores:
-    """Scores each policy by its return under the reward that the reference points define.
-
-    A state leaves itself out of the reference. With `leave_own_out` it also leaves out the states
-    of its own policy and of policies that the same iteration archived, unless fewer than k points
-    would remain. Points of a history have no row, so a state that is in the history sees itself.
-
-    Args:
-      points: [M, F] the reference.
-      rows: [M] int32, each point's row in the occupancy; -1 for none.
-      archive: the policies to score.
-      num_filled: [] int32, how many of the points are filled; all of them if None.
-    Returns:
-      The scores, [P] each.
-    """
-    config = components.config
-    num_rows = occupancy.policy.shape[0]
-    capacity = jax.tree.leaves(archive.parameters)[0].shape[0]
-    label = capacity + jnp.arange(num_rows, dtype=jnp.int32)  # a state's own, or its iteration's
-    if config.mixture.leave_own_out:
-        iteration = (occupancy.policy + config.mixture.snapshots - 1) // config.mixture.snapshots
-        owner = jnp.where(rows < 0, -1, iteration[rows])
-        others = jnp.sum(owner[None] != jnp.arange(capacity)[:, None], axis=1)  # [P]
-        alone = others < config.intrinsic.num_neighbors
-        label = jnp.where(alone[iteration], label, iteration)
-    point_label = jnp.where(rows < 0, NONE_EXCLUDED - 1, label[rows])
-    distance = knn_distances(
-        occupancy.features,
-        points,
-        config.intrinsic.num_neighbors,
-        exclude=label,
-        count=num_filled,
-        labels=point_label,
-    )[:, -1]
-    reward = components.unshaped_reward(distance)
-    alive = occupancy.alive.astype(jnp.float32)
-    total = jnp.zeros(capacity).at[occupancy.policy].add(jnp.where(alive > 0, reward, 0.0))
-    lived = jnp.zeros(capacity).at[occupancy.policy].add(alive)
-    played = jnp.zeros(capacity).at[occupancy.episode_policy].add(1.0)
-    return Scores(total / jnp.maximum(played, 1), total / jnp.maximum(lived, 1))
-
-
-def best(scores: Scores, occupancy: Occupancy) -> jax.Array:
-    """Returns the policy with the highest return among those that played, [] int32."""
-    capacity = scores.episode_return.shape[0]
-    played = jnp.zeros(capacity, bool).at[occupancy.episode_policy].set(True)
-    return jnp.argmax(jnp.where(played, scores.episode_return, -jnp.inf)).astype(jnp.int32)
 
 
 def measures(components: Components, occupancy: Occupancy, key: jax.Array) -> Metrics:

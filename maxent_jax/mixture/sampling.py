@@ -59,7 +59,10 @@ def _rows_by_episode(weights: jax.Array, ticks: jax.Array, num_episodes: int) ->
 
 
 def _rows_at(weights: jax.Array, ticks: jax.Array) -> jax.Array:
-    """The rows [n] int32 at the ticks [n], shares of all weight; from 1 on the last row."""
+    """The rows [n] int32 at the ticks [n], which are shares of the sum of the weights.
+
+    A tick of 1 or more gives the last row that has weight.
+    """
     # A parallel sum rounds each prefix separately. Without the running maximum it could fall, or
     # rise at a row of weight 0.
     cumulative = jax.lax.cummax(jnp.where(weights > 0, jnp.cumsum(weights), 0.0))

@@ -1,5 +1,6 @@
 """The SAC learner: init, update, act. A Config gives the settings, the caller the sizes."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -10,10 +11,11 @@ from maxent_jax import moments
 from maxent_jax.config import Config
 from maxent_jax.moments import Moments
 from maxent_jax.sac import losses
-from maxent_jax.sac.networks import Actor, Critic, Inputs
+from maxent_jax.sac.networks import Actor, Critic
 from maxent_jax.types import Metrics
 
 LARGEST_INPUT = 10.0  # standard deviations, at which normalised inputs are clipped
+Inputs = Callable[[jax.Array], jax.Array]  # observation [..., D] -> what the networks see [..., I]
 
 
 class Policy(NamedTuple):
@@ -43,7 +45,7 @@ class Agent(NamedTuple):
 
     parameters: Parameters
     optimizer: Any
-    average: Any  # moving average of the actor, which is archived then; else None
+    average: Any  # moving average of the actor, archived in its place; None: there is none
 
 
 class Sac(NamedTuple):
@@ -69,11 +71,7 @@ def make(config: Config, observation_size: int, action_size: int, inputs: Inputs
     own = config.learner
     return Sac(
         actor=Actor(action_size, own.hidden_layers, own.hidden_size),
-        critic=Critic(
-            own.hidden_layers,
-            own.hidden_size,
-            own.critic_layer_norm,
-        ),
+        critic=Critic(own.hidden_layers, own.hidden_size, own.critic_layer_norm),
         inputs=inputs,
         observation_size=observation_size,
         action_size=action_size,
@@ -169,7 +167,7 @@ def update(
       agent: the learner.
       batch: [B] transitions.
       key: of the actions drawn.
-      only_critics: [] bool, whether actor and temperature stay as they are; None: they never do.
+      only_critics: [] bool, whether actor and temperature stay as they are; None: they learn.
     Returns:
       The learner after the step, and metrics.
     """

@@ -1,7 +1,5 @@
 """Networks of policies, critics and bonuses: the only flax modules of the package."""
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
@@ -94,6 +92,3 @@ class Critic(nn.Module):
             nn.Dense(1)(Torso(self.num_layers, self.size, self.layer_norm)(x)) for _ in range(2)
         ]
         return jnp.concatenate(values, axis=-1)
-
-
-Inputs = Callable[[jax.Array], jax.Array]  # observation [..., D] -> what the networks see [..., I]
