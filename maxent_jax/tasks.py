@@ -149,7 +149,7 @@ def _run(robot: _Robot, env: MujocoEnv, degrees: float) -> Reward:
     def reward(observation, action, next_observation):
         del action
         moved = _position(robot, next_observation) - _position(robot, observation)
-        return moved @ direction / env.dt
+        return jnp.matmul(moved, direction, precision="highest") / env.dt
 
     return reward
 
