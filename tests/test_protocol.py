@@ -17,7 +17,7 @@ from maxent_jax.commands import reproduce, train
 from maxent_jax.config import preset
 from maxent_jax.errors import ConfigError
 from maxent_jax.features import make_feature_map
-from maxent_jax.runs import files
+from maxent_jax.runs import atomic, files
 from maxent_jax.studies import paper_figures, protocol, results, values
 from maxent_jax.studies.protocol import Cell
 
@@ -428,7 +428,7 @@ def test_an_entropy_that_json_cannot_hold_is_the_lowest_of_all(tmp_path):
     files.append_metrics(tmp_path / cell.name, row)
     (found,) = values.read(tmp_path, [cell])
     assert found["mixture_knn_entropy"] == -np.inf and found["mixture_entropy"] == 1
-    files.write_csv(tmp_path / "raw.csv", values.COLUMNS, [found])
+    atomic.write_csv(tmp_path / "raw.csv", values.COLUMNS, [found])
     assert "-inf" in (tmp_path / "raw.csv").read_text()
 
 

@@ -15,7 +15,7 @@ import tyro
 from maxent_jax import errors
 from maxent_jax.checks import check_seed
 from maxent_jax.commands import cli
-from maxent_jax.runs import files, integrity, runtime
+from maxent_jax.runs import atomic, files, integrity, runtime
 from maxent_jax.visual import headless
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def main(argv: Sequence[str]) -> None:
 
         gymnasium_play.make(config).close()  # fails here rather than after the rollouts
     report = evaluate(arguments)
-    files.write_json(files.evaluation(arguments.directory, arguments.seed_index), report)
+    atomic.write_json(files.evaluation(arguments.directory, arguments.seed_index), report)
     _print(report)
 
 

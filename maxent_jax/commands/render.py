@@ -16,7 +16,7 @@ import tyro
 from maxent_jax import errors
 from maxent_jax.checks import check_seed
 from maxent_jax.commands import cli
-from maxent_jax.runs import files, integrity, progress, runtime
+from maxent_jax.runs import atomic, files, integrity, progress, runtime
 from maxent_jax.visual import headless, video
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ class _Studio:
             frames.mosaic([frames.picture(shot, episode, step) for episode in episodes], columns)
             for step in progress.track(steps, name)
         )
-        with files.whole_file(self._folder / f"{name}.mp4") as temporary:
+        with atomic.whole_file(self._folder / f"{name}.mp4") as temporary:
             video.write(temporary, pictures, self._frame_rate)
         self.num_videos += 1
         self.longest = max(self.longest, len(steps) / self._frame_rate)
@@ -164,5 +164,5 @@ class _Studio:
         tiles = [
             frames.picture(self._still, episode, step) for episode in episodes for step in shown
         ]
-        with files.whole_file(self._folder / f"{name}.png") as temporary:
+        with atomic.whole_file(self._folder / f"{name}.png") as temporary:
             Image.fromarray(frames.mosaic(tiles, columns=len(shown))).save(temporary)

@@ -13,7 +13,7 @@ from typing import Any
 
 from maxent_jax import errors
 from maxent_jax.commands import cli, trajectories
-from maxent_jax.runs import files, progress, runtime
+from maxent_jax.runs import atomic, files, progress, runtime
 from maxent_jax.visual import headless
 
 FITTED = ("river swim", "Garnet", "double chain", "four rooms", "open grid")
@@ -60,12 +60,12 @@ def main(argv: Sequence[str]) -> None:
     arguments = _check(cli.parse(Arguments, argv, "theory"))
     headless.draw_nothing()
     runtime.start(simulates_in_jax=False)
-    results = files.jsonable(study(arguments))
+    results = atomic.jsonable(study(arguments))
     from maxent_jax.theory import tabular_figures
 
     folder = arguments.figures or arguments.out.parent
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    files.write_json(arguments.out, results)
+    atomic.write_json(arguments.out, results)
     paths = tabular_figures.draw(results, folder)
     _print(results)
     print(", ".join(str(path) for path in (arguments.out, *paths)))

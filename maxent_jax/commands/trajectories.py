@@ -12,7 +12,7 @@ from typing import Any
 
 from maxent_jax import errors
 from maxent_jax.commands import cli
-from maxent_jax.runs import files, progress, runtime
+from maxent_jax.runs import atomic, files, progress, runtime
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,9 +37,9 @@ def main(argv: Sequence[str]) -> None:
     """Parses and checks the arguments, and only then computes."""
     arguments = _check(cli.parse(Arguments, argv, "theory trajectories"))
     runtime.start(simulates_in_jax=False)
-    results = files.jsonable(study(arguments))
+    results = atomic.jsonable(study(arguments))
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    files.write_json(arguments.out, results)
+    atomic.write_json(arguments.out, results)
     _print(results)
     print(arguments.out)
 

@@ -30,7 +30,7 @@ from maxent_jax.config import Config
 from maxent_jax.envs.base import Episodes, Restarts
 from maxent_jax.errors import CheckpointError, SaveError
 from maxent_jax.mixture import Archive
-from maxent_jax.runs import files, integrity
+from maxent_jax.runs import atomic, files, integrity
 from maxent_jax.runs.integrity import ARRAYS, FOLDER, UNFINISHED
 from maxent_jax.runs.progress import say
 from maxent_jax.sac.agent import Parameters
@@ -232,7 +232,7 @@ def _write_progress(folder: Path, progress: Progress, machine: dict[str, Any]) -
         "clock": progress.clock,
         "computed_with": files.stack() | machine,
     }
-    files.write_json(folder / PROGRESS, content)
+    atomic.write_json(folder / PROGRESS, content)
 
 
 @contextlib.contextmanager

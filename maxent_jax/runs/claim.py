@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from maxent_jax.config import Config
 from maxent_jax.errors import UsageError
-from maxent_jax.runs import files, integrity, locks
+from maxent_jax.runs import atomic, files, integrity, locks
 from maxent_jax.runs.loggers import FOLDERS as LOGGERS
 
 
@@ -100,12 +100,11 @@ def _is_of_a_beginning(path: Path) -> bool:
             inside.name.startswith(integrity.UNFINISHED) for inside in path.iterdir()
         )
         return unfinished and not path.is_symlink()
-    temporary = {
-        files.temporary_of(directory / name).name for name in (files.CONFIG, files.METRICS)
-    }
     if path.name in (*LOGGERS, files.FIRST):
         return (directory / files.CONFIG).is_file()
-    return path.name in {locks.LOCK, *temporary}
+    return path.name == locks.LOCK or any(
+        atomic.is_temporary_of(path.name, name) for name in (files.CONFIG, files.METRICS)
+    )
 
 
 def _remove_run(directory: Path) -> None:

@@ -13,7 +13,16 @@ from maxent_jax import algorithm, components, native
 from maxent_jax.algorithm import Programs, State, devices, finetune, methods
 from maxent_jax.config import Config
 from maxent_jax.errors import UsageError
-from maxent_jax.runs import checkpoint, files, hosts, integrity, memory, runtime, source
+from maxent_jax.runs import (
+    atomic,
+    checkpoint,
+    files,
+    hosts,
+    integrity,
+    memory,
+    runtime,
+    source,
+)
 from maxent_jax.runs.checkpoint import Progress
 from maxent_jax.runs.clock import Clock
 from maxent_jax.runs.loggers import Sinks
@@ -130,7 +139,7 @@ def _from_source(config: Config, directory: Path, placed: State | None) -> State
     archive, name = source.load(config)
     state, first = finetune.start(config, archive)
     found = {"source": config.downstream.source, "checkpoint": name} | first._asdict()
-    hosts.first_alone(lambda: files.write_json(directory / files.FIRST, found), "first episodes")
+    hosts.first_alone(lambda: atomic.write_json(directory / files.FIRST, found), "first episodes")
     return state if placed is None else jax.device_put(state, placed)
 
 

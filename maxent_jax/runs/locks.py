@@ -7,7 +7,7 @@ from pathlib import Path
 import filelock
 
 from maxent_jax.errors import UsageError
-from maxent_jax.runs import files
+from maxent_jax.runs import atomic
 
 LOCK = "lock"
 
@@ -42,5 +42,5 @@ def holding(directory: Path, wait: bool = True) -> Iterator[None]:
 
 def is_free(directory: Path, first: str) -> bool:
     """Whether a directory holds only its lock and an unfinished `first`, the first file written."""
-    begun = (LOCK, files.temporary_of(directory / first).name)
-    return all(path.name in begun for path in directory.iterdir())
+    names = [path.name for path in directory.iterdir()]
+    return all(name == LOCK or atomic.is_temporary_of(name, first) for name in names)

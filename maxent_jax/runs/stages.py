@@ -11,7 +11,7 @@ from maxent_jax import algorithm, errors
 from maxent_jax.algorithm import Programs, State
 from maxent_jax.algorithm.convergence import has_plateaued
 from maxent_jax.config import Config
-from maxent_jax.runs import files, integrity
+from maxent_jax.runs import atomic, integrity
 from maxent_jax.runs.checkpoint import Progress
 from maxent_jax.runs.clock import Clock
 from maxent_jax.runs.progress import Bar
@@ -41,7 +41,7 @@ def advance(
         bar.segment_done()
         return Stage(state, progress._replace(segments=[*progress.segments, metrics]))
     state, at_end = clock.time("wall_end", programs.end, state)
-    row = files.jsonable(_row(config, progress, at_end) | clock.end_iteration())
+    row = atomic.jsonable(_row(config, progress, at_end) | clock.end_iteration())
     bar.iteration_done(row)
     return Stage(state, progress._replace(rows=[*progress.rows, row], begun=None, segments=[]))
 

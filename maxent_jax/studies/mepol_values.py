@@ -17,7 +17,7 @@ from maxent_jax import components
 from maxent_jax.baselines import mepol
 from maxent_jax.baselines.mepol import Settings
 from maxent_jax.config import Config
-from maxent_jax.runs import files
+from maxent_jax.runs import atomic, files
 from maxent_jax.studies import values
 from maxent_jax.studies.values import COLUMNS, Row
 
@@ -27,7 +27,7 @@ METHOD, RESULTS = "MEPOL", "mepol.json"
 def rows(directory: Path, config: Config, num_seeds: int) -> list[Row]:
     """Returns a row per seed and iteration: computes them once, then reads the directory's file."""
     path = directory / RESULTS
-    asked = files.jsonable(
+    asked = atomic.jsonable(
         {"config": config.flat(), "seeds": num_seeds}
         | {"settings": dataclasses.asdict(settings_of(config))}
     )
@@ -36,7 +36,7 @@ def rows(directory: Path, config: Config, num_seeds: int) -> list[Row]:
         if {name: held.get(name) for name in asked} == asked:
             return [values.known(row) for row in held["rows"]]
     found = _train(config, num_seeds)
-    files.write_json(path, asked | {"versions": files.stack(), "rows": found})
+    atomic.write_json(path, asked | {"versions": files.stack(), "rows": found})
     return found
 
 

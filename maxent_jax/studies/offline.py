@@ -19,7 +19,7 @@ from maxent_jax import components
 from maxent_jax.analysis import dataset, load_run
 from maxent_jax.baselines import td3_bc
 from maxent_jax.baselines.td3_bc import Settings
-from maxent_jax.runs import files, progress
+from maxent_jax.runs import atomic, files, progress
 from maxent_jax.studies import protocol, statistics
 from maxent_jax.studies.protocol import Cell
 
@@ -79,7 +79,7 @@ def _row(directory: Path, scale: str, cell: Cell, data: str, task: str) -> Row:
     returns = td3_bc.evaluate(p, settings, policy, num_episodes, key_play)
     row["data_reward"] = float(np.mean(collected["rewards"]))
     row["task_return"] = float(np.mean(returns))
-    files.write_json(path, asked | row | {"versions": files.stack()})
+    atomic.write_json(path, asked | row | {"versions": files.stack()})
     return row
 
 

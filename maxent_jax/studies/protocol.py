@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from maxent_jax.config import DEFAULTS, Config, preset, tasks
 from maxent_jax.config.registry import BASELINES, CLASSIC_ENVS, METRA, MUJOCO_ENVS, PLAIN
 from maxent_jax.errors import UsageError
-from maxent_jax.runs import files, integrity, locks, source
+from maxent_jax.runs import atomic, files, integrity, locks, source
 
 STUDY = "study.json"
 VERSION = 1  # of the layout of a study's directory
@@ -291,7 +291,7 @@ def claim(directory: Path, study: str, scale: str, cells: list[Cell]) -> None:
       UsageError: the directory holds another study, or this one with other settings, or cannot be
         written.
     """
-    content = files.jsonable(
+    content = atomic.jsonable(
         {
             "version": VERSION,
             "study": study,
@@ -318,7 +318,7 @@ def _claim(directory: Path, content: Changes) -> None:
             return
     elif not locks.is_free(directory, STUDY):
         raise UsageError(f"{directory} is not a study's, and not empty: choose another --out.")
-    files.write_json(path, content)
+    atomic.write_json(path, content)
 
 
 def _difference(held: Changes, asked: Changes) -> str:
@@ -343,7 +343,7 @@ def home(directory: Path, cell: Cell) -> Path:
     """
     own = directory / cell.name
     if not own.exists() and cell.source is None:
-        config = files.jsonable(cell.config.flat())
+        config = atomic.jsonable(cell.config.flat())
         for study in sorted(directory.parent.glob(f"*/{STUDY}")):
             for name, held in _cells(study).items():
                 if held == config and (study.parent / name).exists():

@@ -18,7 +18,8 @@ from maxent_jax.config import tasks
 from maxent_jax.density import histogram
 from maxent_jax.density.histogram import Grid
 from maxent_jax.mixture.occupancy import Occupancy
-from maxent_jax.runs.files import FIGURES, whole_file, writing
+from maxent_jax.runs.atomic import whole_file, writing
+from maxent_jax.runs.files import FIGURES
 
 COVERAGE_AXES = (
     ("iteration", "iteration"),
