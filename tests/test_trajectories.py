@@ -200,7 +200,7 @@ def test_the_entry_point_at_toy_size(tmp_path, capsys):
         (["--iterations", "0"], "--iterations must be at least 1."),
         (["--seeds", "0"], "--seeds must be at least 1."),
         (["--seed", "-1"], "--seed must be 0 or more, and below 2^31."),
-        (["--out", "."], "--out . is a folder: name a file."),
+        (["--out", "."], ". is a folder: name a file."),
         (["--mdp", "own.npz"], "--mdp"),
     ],
 )

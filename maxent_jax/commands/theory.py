@@ -58,13 +58,14 @@ def main(argv: Sequence[str]) -> None:
         trajectories.main(argv[1:])
         return
     arguments = _check(cli.parse(Arguments, argv, "theory"))
+    folder = arguments.figures or arguments.out.parent
+    atomic.check_file(arguments.out)
+    atomic.check_folder(folder)
     headless.draw_nothing()
     runtime.start(simulates_in_jax=False)
     results = atomic.jsonable(study(arguments))
     from maxent_jax.theory import tabular_figures
 
-    folder = arguments.figures or arguments.out.parent
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
     atomic.write_json(arguments.out, results)
     paths = tabular_figures.draw(results, folder)
     _print(results)
@@ -137,7 +138,6 @@ def _check(arguments: Arguments) -> Arguments:
             "--seeds must be at least 2, and --few-seeds from 1 to --seeds.",
         ),
         (not 0 <= arguments.seed < 2**31, "--seed must be 0 or more, and below 2^31."),
-        (arguments.out.is_dir(), f"--out {arguments.out} is a folder: name a file."),
     ):
         if wrong:
             raise errors.UsageError(sentence)

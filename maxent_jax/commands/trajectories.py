@@ -36,9 +36,9 @@ class Arguments:
 def main(argv: Sequence[str]) -> None:
     """Parses and checks the arguments, and only then computes."""
     arguments = _check(cli.parse(Arguments, argv, "theory trajectories"))
+    atomic.check_file(arguments.out)
     runtime.start(simulates_in_jax=False)
     results = atomic.jsonable(study(arguments))
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
     atomic.write_json(arguments.out, results)
     _print(results)
     print(arguments.out)
@@ -74,8 +74,6 @@ def _check(arguments: Arguments) -> Arguments:
             raise errors.UsageError(f"--{name} must be at least 1.")
     if not 0 <= arguments.seed < 2**31:
         raise errors.UsageError("--seed must be 0 or more, and below 2^31.")
-    if arguments.out.is_dir():
-        raise errors.UsageError(f"--out {arguments.out} is a folder: name a file.")
     return arguments
 
 
