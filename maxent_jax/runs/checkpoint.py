@@ -87,10 +87,11 @@ def save(run_directory: Path, state: State, progress: Progress, machine: dict[st
             files.write_metrics(temporary, progress.rows)
             _write_progress(temporary, progress, machine)
             integrity.seal(temporary)
-            shutil.rmtree(folder / progress.name, ignore_errors=True)
+            if (folder / progress.name).exists():
+                integrity.remove(run_directory, progress.name)
             temporary.rename(folder / progress.name)
             for old in integrity.checkpoints(run_directory)[:-CHECKPOINTS_KEPT]:
-                shutil.rmtree(folder / old)
+                integrity.remove(run_directory, old)
     except (OSError, ValueError, SaveError) as error:  # TensorStore raises ValueErrors
         shutil.rmtree(temporary, ignore_errors=True)
         raise SaveError(
@@ -252,7 +253,8 @@ def _reason(error: Exception) -> str:
     code = re.search(r"os_error_code='(\d+)'", str(error))
     if code:
         return os.strerror(int(code[1]))
-    return getattr(error, "strerror", None) or str(error).splitlines()[0]
+    said = str(error).splitlines() or [type(error).__name__]
+    return getattr(error, "strerror", None) or said[0]
 
 
 def _beneath(prefix: str, parts: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -1,7 +1,6 @@
 """Runs the three programs of an iteration one by one, and logs and saves in between."""
 
 import os
-import shutil
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -158,7 +157,7 @@ def _last_progress(directory: Path, options: Options) -> Progress | None:
 
     def go_back_to_it() -> None:
         for damaged, sentence in passed_over.items():
-            shutil.rmtree(directory / integrity.FOLDER / damaged)
+            integrity.remove(directory, damaged)
             say(f"note: {sentence[:-1]}; it is removed, the run continues from checkpoint {name}.")
         for what, now in (files.stack() | _machine()).items():
             if computed_with.get(what) != now:
