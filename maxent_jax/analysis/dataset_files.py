@@ -96,8 +96,8 @@ def write(
     with locks.holding(directory, wait=False):
         written = _on_disk(directory, atomic.jsonable(content))
         if form != "minari":  # a reader would take half an episode for one
-            atomic.clear(directory)
-            atomic.clear(directory / EPISODES)
+            atomic.clear(directory, ".npz")
+            atomic.clear(directory / EPISODES, ".npz")
         if written.transitions == num:
             return
         atomic.write_json(directory / MANIFEST, _manifest(content, written))

@@ -64,9 +64,7 @@ def main(argv: Sequence[str]) -> None:
         tasks.parse(arguments.task, config.env)
         tasks.check_registered(arguments.task)
     integrity.check_any(arguments.directory)
-    out = arguments.out or arguments.directory.with_name(
-        f"{arguments.directory.name}-{arguments.format}"
-    )
+    out = arguments.out or files.beside(arguments.directory, arguments.format)
     headless.draw_nothing()
     runtime.start(config.simulates_in_jax)
     from maxent_jax.analysis import dataset_files, load_run

@@ -102,14 +102,16 @@ def _is_of_a_beginning(path: Path) -> bool:
         return unfinished and not path.is_symlink()
     if path.name in (*LOGGERS, files.FIRST):
         return (directory / files.CONFIG).is_file()
-    return path.name == locks.LOCK or any(
-        atomic.is_temporary_of(path.name, name) for name in (files.CONFIG, files.METRICS)
-    )
+    return path.name == locks.LOCK or atomic.final_of(path.name) in (files.CONFIG, files.METRICS)
 
 
 def _remove_run(directory: Path) -> None:
-    """Removes all that a run writes, and nothing else."""
-    for path in [path for path in directory.iterdir() if files.is_written(path.name)]:
+    """Removes all that a run writes, and nothing else.
+
+    The config goes last: without it, a removal that was interrupted could not be repeated.
+    """
+    written = [path for path in directory.iterdir() if files.is_written(path.name)]
+    for path in sorted(written, key=lambda path: path.name == files.CONFIG):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         else:

@@ -82,7 +82,7 @@ def read_config(directory: Path) -> Config:
         )
     try:
         return from_flat(_ungrouped(settings))
-    except (TypeError, ConfigError) as error:
+    except (TypeError, AttributeError, ConfigError) as error:
         raise RunError(f"{path} does not match this release: {error}") from None
 
 
@@ -99,8 +99,15 @@ def evaluation(directory: Path, seed_index: int = 0) -> Path:
     return directory / (f"evaluation_seed_{seed_index}.json" if seed_index else EVALUATION)
 
 
+def beside(directory: Path, ending: str) -> Path:
+    """Returns the path of a sibling of a run's directory, named after it: runs/ant-ENDING."""
+    named = directory if directory.name not in ("", "..") else Path(os.path.abspath(directory))
+    return named.with_name(f"{named.name}-{ending}")
+
+
 def is_written(name: str) -> bool:
     """Whether a command writes a file or folder of this name into a run's directory."""
+    name = atomic.final_of(name) or name
     return name in WRITTEN or re.fullmatch(r"evaluation_seed_\d+\.json", name) is not None
 
 
@@ -177,14 +184,20 @@ def read_metrics(directory: Path) -> list[dict[str, Any]]:
     """Reads the rows of metrics.jsonl; skips an unfinished last line.
 
     Raises:
-      RunError: a line is not JSON.
+      RunError: a line is not a JSON object.
     """
     path = directory / METRICS
-    lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
-    try:
-        return [json.loads(line) for line in lines]
-    except ValueError:
-        raise RunError(f"{path} holds a line that is not JSON.") from None
+    lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            rows.append(dict(json.loads(line)))
+        except (ValueError, TypeError):
+            raise RunError(
+                f"line {number} of {path} is not a JSON object: the command train --resume writes "
+                f"the file again, from the last checkpoint."
+            ) from None
+    return rows
 
 
 def of_seed(row: dict[str, Any], index: int) -> dict[str, Any]:
@@ -196,7 +209,7 @@ def write_metrics(directory: Path, rows: list[dict[str, Any]]) -> None:
     """Writes metrics.jsonl with exactly these rows, unless it has them already."""
     path, text = directory / METRICS, _lines(rows)
     if not path.exists() or path.read_text(encoding="utf-8") != text:
-        atomic.write_text(path, text)
+        atomic.write(path, text)
 
 
 def as_name(text: str) -> str:

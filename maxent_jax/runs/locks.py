@@ -31,7 +31,9 @@ def holding(directory: Path, wait: bool = True) -> Iterator[None]:
         directory.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except filelock.Timeout:
-        raise BusyError(f"another process is training in {directory}: wait for its end.") from None
+        raise BusyError(
+            f"another process writes in {directory}: wait until it ends, or choose another --out."
+        ) from None
     except OSError as error:
         raise UsageError(f"cannot write to {directory}: {error.strerror}.") from None
     try:
@@ -43,4 +45,4 @@ def holding(directory: Path, wait: bool = True) -> Iterator[None]:
 def is_free(directory: Path, first: str) -> bool:
     """Whether a directory holds only its lock and an unfinished `first`, the first file written."""
     names = [path.name for path in directory.iterdir()]
-    return all(name == LOCK or atomic.is_temporary_of(name, first) for name in names)
+    return all(name == LOCK or atomic.final_of(name) == first for name in names)
