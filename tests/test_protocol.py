@@ -310,6 +310,15 @@ def test_environments_are_summarised_apart_and_never_confused():
     }
 
 
+def test_a_summary_counts_the_seeds_of_each_environment():
+    """As in fig4 at scale cpu: five seeds of Ant, three of Humanoid."""
+    names = ("env_steps", *results.SUMMARISED)
+    seeds = {"ant": 5, "humanoid": 3}
+    columns = {env: dict.fromkeys(names, np.ones((number, 2))) for env, number in seeds.items()}
+    groups = [(env, method, columns[env]) for env in columns for method in ("V", "H")]
+    assert results.summarise(groups)["seeds"] == seeds
+
+
 def test_what_methods_differ_in_as_a_number_is_an_axis():
     """Each study's numbers, and what is drawn over them: mean, interval and every seed."""
     found = {}

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -387,7 +388,7 @@ def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> R
     return Run(
         path=directory,
         config=config,
-        metrics={name: _column(rows, name) for name in rows[0]} if rows else {},
+        metrics={name: _column(rows, name) for name in dict.fromkeys(itertools.chain(*rows))},
         seed=config.seed + seed_index,
         mixture=results.archive,
         histogram=np.asarray(results.visits.cells),
@@ -430,5 +431,8 @@ def _scalar_columns(metrics: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _column(rows: list[dict[str, Any]], name: str) -> np.ndarray:
-    values = np.array([row.get(name) for row in rows])
+    """[T, ...]; NaN where a row lacks it: an older release did not measure it."""
+    known = [np.shape(row[name]) for row in rows if row.get(name) is not None]
+    missing = np.full(known[0] if known else (), np.nan)
+    values = np.array([missing if row.get(name) is None else row[name] for row in rows])
     return values.astype(float) if values.dtype == object else values

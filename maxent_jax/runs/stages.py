@@ -91,11 +91,14 @@ def check_finite(directory: Path, state: State, progress: Progress) -> None:
     if wrong:
         where = jax.tree_util.keystr(wrong[0], simple=True, separator=".")
         iteration = len(progress.rows) + (progress.begun is not None)
+        when = f"in segment {len(progress.segments)}" if progress.segments else "at its beginning"
+        if progress.begun is None:
+            when = "at its end"
+        saved = integrity.checkpoints(directory)
         raise errors.NonFiniteError(
-            f"iteration {iteration} produced a number that is not finite after "
-            f"{len(progress.segments)} of its segments (first in {where}): this is not saved, and "
-            f"{directory} holds the run up to checkpoint "
-            f"{(integrity.checkpoints(directory) or ['none'])[-1]}."
+            f"iteration {iteration} produced a number that is not finite {when} (first in "
+            f"{where}): this is not saved, and {directory} holds "
+            f"{f'the run up to checkpoint {saved[-1]}' if saved else 'no checkpoint yet'}."
         )
 
 

@@ -209,7 +209,7 @@ def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[
     }
     return {
         "compared_with": ours,
-        "seeds": len(groups[0][2]["env_steps"]),
+        "seeds": {env: len(columns["env_steps"]) for env, _, columns in groups},
         "last_iteration": {
             env: {name: statistics.compare(by_method, ours) for name, by_method in of_env.items()}
             for env, of_env in last.items()
