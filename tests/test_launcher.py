@@ -11,7 +11,8 @@ import commands
 import pytest
 import submitit
 
-from maxent_jax.commands import launcher, reproduce, train
+from maxent_jax import training
+from maxent_jax.commands import launcher, reproduce
 from maxent_jax.runs import files, locks
 from maxent_jax.runs.signals import Interrupted
 from maxent_jax.studies import protocol
@@ -168,7 +169,7 @@ def test_a_worker_waits_for_what_another_trains_and_others_start_from(tmp_path, 
 
     monkeypatch.setattr(reproduce.time, "sleep", other_ends)
     monkeypatch.setattr(protocol, "finished", lambda _, cell: cell.name in done)
-    monkeypatch.setattr(train, "run_to_end", lambda config, at, *_: done.append(at.name))
+    monkeypatch.setattr(training, "run_to_end", lambda config, at, *_: done.append(at.name))
     other.__enter__()
     assert reproduce._train(tmp_path, cells) == 0
     assert done == names and waited == [reproduce.POLL_SECONDS]
@@ -176,7 +177,7 @@ def test_a_worker_waits_for_what_another_trains_and_others_start_from(tmp_path, 
 
 def test_a_worker_ends_while_another_trains_the_last_cell(tmp_path, monkeypatch):
     cells, trained = protocol.make("fig4", "toy", 1), []
-    monkeypatch.setattr(train, "run_to_end", lambda config, at, *_: trained.append(at.name))
+    monkeypatch.setattr(training, "run_to_end", lambda config, at, *_: trained.append(at.name))
     monkeypatch.setattr(protocol, "finished", lambda _, cell: cell.name in trained)
     monkeypatch.setattr(reproduce.time, "sleep", None)
     with locks.holding(tmp_path / cells[0].name):
@@ -191,7 +192,7 @@ def test_a_signal_in_a_cells_last_iteration_stops_the_study(tmp_path, monkeypatc
         trained.append(directory.name)
         return signal.SIGTERM
 
-    monkeypatch.setattr(train, "run_to_end", stopped_too_late)
+    monkeypatch.setattr(training, "run_to_end", stopped_too_late)
     with pytest.raises(Interrupted, match="SIGTERM"):
         reproduce._train(tmp_path, protocol.make("fig4", "toy", 1))
     assert len(trained) == 1

@@ -12,8 +12,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from maxent_jax import errors
-from maxent_jax.commands import reproduce, train
+from maxent_jax import errors, training
+from maxent_jax.commands import reproduce
 from maxent_jax.config import preset
 from maxent_jax.errors import ConfigError
 from maxent_jax.features import make_feature_map
@@ -169,7 +169,7 @@ def test_processes_may_claim_a_directory_at_the_same_time(tmp_path):
 def finished(tmp_path_factory):
     """fig5 at toy size, which needs the runs of fig4, stopped once in the middle; and the calls."""
     out, trained = tmp_path_factory.mktemp("studies"), []
-    whole = train.run_to_end
+    whole = training.run_to_end
 
     def until_the_second(config, directory, *rest):
         if len(trained) == 1:
@@ -183,10 +183,10 @@ def finished(tmp_path_factory):
 
     argv = ["fig5", *TOY, "--out", str(out)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train, "run_to_end", until_the_second)
+        patch.setattr(training, "run_to_end", until_the_second)
         with pytest.raises(KeyboardInterrupt):
             reproduce.main(argv)
-        patch.setattr(train, "run_to_end", all_of_it)
+        patch.setattr(training, "run_to_end", all_of_it)
         reproduce.main(argv)
         reproduce.main(["fig4", *TOY, "--out", str(out)])
     return out, trained
@@ -200,7 +200,7 @@ def test_a_stopped_study_repeats_no_finished_cell(finished):
 def test_a_run_that_another_study_has_is_not_trained_again(finished, monkeypatch):
     out, _ = finished
     trained = []
-    monkeypatch.setattr(train, "run_to_end", lambda config, at, *_: trained.append(at))
+    monkeypatch.setattr(training, "run_to_end", lambda config, at, *_: trained.append(at))
     for study in ("start", "weights", "refresh"):
         reproduce.main([study, *TOY, "--out", str(out), "--no-figures"])
     names = {directory.relative_to(out).as_posix() for directory in trained}
@@ -231,7 +231,7 @@ def test_a_finished_run_with_other_settings_is_no_cell(finished, monkeypatch, ca
     content["config"]["eta"] = 0.5
     path.write_text(json.dumps(content))
     trained = []
-    monkeypatch.setattr(train, "run_to_end", lambda config, at, *_: trained.append(at))
+    monkeypatch.setattr(training, "run_to_end", lambda config, at, *_: trained.append(at))
     with pytest.raises(SystemExit) as stop:
         reproduce.main(["fig4", *TOY, "--out", str(out)])
     path.write_text(kept)
@@ -249,7 +249,7 @@ def test_a_cell_that_cannot_be_trained_does_not_keep_the_others_from_it(
         if len(trained) == 1:
             raise errors.NonFiniteError("the loss is not finite.")
 
-    monkeypatch.setattr(train, "run_to_end", fail_once)
+    monkeypatch.setattr(training, "run_to_end", fail_once)
     with pytest.raises(SystemExit) as stop:
         reproduce.main(["fig4", *TOY, "--out", str(tmp_path)])
     assert stop.value.code == 1

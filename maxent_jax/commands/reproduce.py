@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from maxent_jax import errors
+from maxent_jax import errors, training
 from maxent_jax.checks import check_choice
-from maxent_jax.commands import cli, launcher, train
+from maxent_jax.commands import cli, launcher
 from maxent_jax.runs import files, locks, runtime
 from maxent_jax.runs.claim import Claim
 from maxent_jax.runs.signals import Interrupted, heeded
@@ -198,7 +198,7 @@ def _train_cell(directory: Path, cell: Cell) -> bool:
     with Claim(at, config, resume=True).hold():
         from maxent_jax.runs import driver  # loads jax
 
-        received = train.run_to_end(config, at, started, driver.Options(fallback=True))
+        received = training.run_to_end(config, at, started, driver.Options(fallback=True))
     if received is not None:
         raise Interrupted(received, at)
     return True
