@@ -8,7 +8,7 @@ import pytest
 from maxent_jax import training
 from maxent_jax.commands import reproduce
 from maxent_jax.runs import files
-from maxent_jax.studies import downstream, paper_figures, protocol
+from maxent_jax.studies import disk, downstream, paper_figures, protocol
 
 
 def cells_of(scale, num_seeds=1):
@@ -101,7 +101,7 @@ def test_a_stopped_study_of_tasks_goes_on(finished):
         "pendulum-V-1-gymnasium-0",
         "pendulum-V-2-gymnasium-0",
     ]
-    assert all(protocol.finished(directory, cell) for cell in cells)
+    assert all(disk.finished(directory, cell) for cell in cells)
     played = [
         len(json.loads((directory / cell.name / files.FIRST).read_text())["task_return"])
         for cell in cells[2:]

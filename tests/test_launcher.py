@@ -15,7 +15,7 @@ from maxent_jax import training
 from maxent_jax.commands import launcher, reproduce
 from maxent_jax.runs import files, locks
 from maxent_jax.runs.signals import Interrupted
-from maxent_jax.studies import protocol
+from maxent_jax.studies import disk, protocol
 
 TOY = ["--scale", "toy", "--seeds", "1"]
 JOB = "77"
@@ -237,7 +237,7 @@ def test_a_study_whose_workers_are_killed_ends_as_one_that_was_not(tmp_path):
     executor = submitit.LocalExecutor(tmp_path / "jobs")
     executor.update_parameters(timeout_min=30, stderr_to_stdout=True)
     rng, kills = random.Random(0), 0
-    while not all(protocol.finished(out, cell) for cell in cells):
+    while not all(disk.finished(out, cell) for cell in cells):
         jobs = launcher.submit(executor, [*study, "--out", str(out.parent)], 2)
         rng.shuffle(jobs)
         target = num_rows(out) + rng.randint(1, 6)
@@ -270,7 +270,7 @@ def test_a_job_whose_time_is_over_saves_and_is_requeued(tmp_path, slurm, monkeyp
     assert log.count("stopping at the next checkpoint") == 1
     assert f"Requeued job {JOB}_{first} " in log
     assert log.count("Starting with JobEnvironment") == 2
-    assert all(protocol.finished(tmp_path / "downstream", cell) for cell in cells)
+    assert all(disk.finished(tmp_path / "downstream", cell) for cell in cells)
     rows = rows_of(tmp_path / "downstream")
     assert list(rows) == sorted(cell.name for cell in cells)
     assert all([row["iteration"] for row in of_cell] == [1, 2] for of_cell in rows.values())

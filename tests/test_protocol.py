@@ -18,7 +18,7 @@ from maxent_jax.config import preset
 from maxent_jax.errors import ConfigError
 from maxent_jax.features import make_feature_map
 from maxent_jax.runs import atomic, files
-from maxent_jax.studies import paper_figures, protocol, results, values
+from maxent_jax.studies import disk, paper_figures, protocol, results, values
 from maxent_jax.studies.protocol import Cell
 
 TOY = ["--scale", "toy", "--seeds", "1"]
@@ -128,40 +128,40 @@ def test_a_directory_belongs_to_one_study_and_may_gain_seeds(tmp_path):
     one, two = (protocol.make("fig4", "cpu", seeds) for seeds in (1, 2))
     directory.mkdir()
     (directory / "study.tmp.json").write_text("{")  # of a process that was killed in its first step
-    protocol.claim(directory, "fig4", "cpu", two)
-    protocol.claim(directory, "fig4", "cpu", one)
-    held = json.loads((directory / protocol.STUDY).read_text())
+    disk.claim(directory, "fig4", "cpu", two)
+    disk.claim(directory, "fig4", "cpu", one)
+    held = json.loads((directory / disk.STUDY).read_text())
     assert set(held["cells"]) == {cell.name for cell in two}
 
     changed = [one[0]._replace(config=one[0].config.replace(eta=0.5))]
     with pytest.raises(errors.UsageError, match=r"eta was 0\.1 and is 0\.5; choose another --out"):
-        protocol.claim(directory, "fig4", "cpu", changed)
+        disk.claim(directory, "fig4", "cpu", changed)
     with pytest.raises(errors.UsageError, match="scale is cpu, not paper"):
-        protocol.claim(directory, "fig4", "paper", protocol.make("fig4", "paper"))
+        disk.claim(directory, "fig4", "paper", protocol.make("fig4", "paper"))
     name = one[0].name
     before = {key: value for key, value in held["cells"][name].items() if key != "stale_rewards"}
     earlier = held | {"cells": held["cells"] | {name: before}}  # of a release without that field
-    (directory / protocol.STUDY).write_text(json.dumps(earlier))
-    protocol.claim(directory, "fig4", "cpu", one)
+    (directory / disk.STUDY).write_text(json.dumps(earlier))
+    disk.claim(directory, "fig4", "cpu", one)
     stale = [one[0]._replace(config=one[0].config.replace(stale_rewards=True))]
-    (directory / protocol.STUDY).write_text(json.dumps(earlier))
+    (directory / disk.STUDY).write_text(json.dumps(earlier))
     with pytest.raises(errors.UsageError, match="stale_rewards was False and is True"):
-        protocol.claim(directory, "fig4", "cpu", stale)
-    (directory / protocol.STUDY).write_text(json.dumps(held | {"version": 0}))
+        disk.claim(directory, "fig4", "cpu", stale)
+    (directory / disk.STUDY).write_text(json.dumps(held | {"version": 0}))
     with pytest.raises(errors.UsageError, match="version is 0, not 1"):
-        protocol.claim(directory, "fig4", "cpu", one)
-    (directory / protocol.STUDY).write_text("{")
+        disk.claim(directory, "fig4", "cpu", one)
+    (directory / disk.STUDY).write_text("{")
     with pytest.raises(errors.UsageError, match="cannot be read"):
-        protocol.claim(directory, "fig4", "cpu", one)
+        disk.claim(directory, "fig4", "cpu", one)
     with pytest.raises(errors.UsageError, match="not empty"):
-        protocol.claim(tmp_path, "fig4", "cpu", one)
+        disk.claim(tmp_path, "fig4", "cpu", one)
 
 
 def test_processes_may_claim_a_directory_at_the_same_time(tmp_path):
     shares = [protocol.make("fig4", "cpu", seeds) for seeds in (1, 2, 3, 4) * 4]
     with ThreadPoolExecutor(16) as pool:
-        list(pool.map(lambda cells: protocol.claim(tmp_path / "s", "fig4", "cpu", cells), shares))
-    held = json.loads((tmp_path / "s" / protocol.STUDY).read_text())
+        list(pool.map(lambda cells: disk.claim(tmp_path / "s", "fig4", "cpu", cells), shares))
+    held = json.loads((tmp_path / "s" / disk.STUDY).read_text())
     assert set(held["cells"]) == {cell.name for cell in shares[3]}
 
 
@@ -213,13 +213,13 @@ def test_a_run_that_another_study_has_is_not_trained_again(finished, monkeypatch
     assert theirs < cells and names == cells - theirs
 
     uniform = protocol.make("weights", "toy", 1)[0]
-    assert protocol.home(out / "weights", uniform) == out / "fig4" / "pendulum-V-0"
+    assert disk.home(out / "weights", uniform) == out / "fig4" / "pendulum-V-0"
     assert values.read(out / "weights", [uniform])[0]["method"] == "uniform"
     (out / "broken").mkdir()
-    (out / "broken" / protocol.STUDY).write_text("{")
-    assert protocol.home(out / "weights", uniform) == out / "fig4" / "pendulum-V-0"
+    (out / "broken" / disk.STUDY).write_text("{")
+    assert disk.home(out / "weights", uniform) == out / "fig4" / "pendulum-V-0"
     (out / "weights" / uniform.name).mkdir()
-    assert protocol.home(out / "weights", uniform) == out / "weights" / uniform.name
+    assert disk.home(out / "weights", uniform) == out / "weights" / uniform.name
 
 
 def test_a_finished_run_with_other_settings_is_no_cell(finished, monkeypatch, capsys):

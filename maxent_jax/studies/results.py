@@ -12,6 +12,7 @@ from maxent_jax.algorithm import methods
 from maxent_jax.config import Config
 from maxent_jax.runs import atomic, files, locks
 from maxent_jax.studies import (
+    disk,
     downstream,
     hazan_weights,
     mepol_values,
@@ -167,7 +168,7 @@ def fig5(directory: Path, trained: Path, cells: Sequence[Cell]) -> None:
     """Draws Fig. 5: the occupancy of each method's first seed, in training and of the mixture."""
     for env in dict.fromkeys(cell.config.env for cell in cells):
         chosen = [c for c in cells if c.config.env == env and c.config.seed == 0]
-        figure = paper_figures.occupancies({c.method: protocol.home(trained, c) for c in chosen})
+        figure = paper_figures.occupancies({c.method: disk.home(trained, c) for c in chosen})
         _save(figure, directory, f"fig5_{env}")
 
 
@@ -220,7 +221,7 @@ def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[
 
 def _versions(directory: Path, cells: Sequence[Cell]) -> list[dict[str, str]]:
     """The different sets of versions that made the runs."""
-    of_cells = [files.read_versions(protocol.home(directory, cell)) for cell in cells]
+    of_cells = [files.read_versions(disk.home(directory, cell)) for cell in cells]
     return [v for i, v in enumerate(of_cells) if v not in of_cells[:i]]
 
 
