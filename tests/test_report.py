@@ -181,7 +181,7 @@ def test_the_comparison_draws_every_seed_in_its_runs_colour():
     [
         ((), "name the directory of one run"),
         (("{run}", "{run}"), "named twice"),
-        (("{run}", "--episodes", "0"), "--episodes must be at least 1"),
+        (("{run}", "--episodes", "0"), "--episodes is 0, but must be at least 1"),
         (("{run}", "--out", "{run}"), "cannot write to"),
         (("{run}", "--out", "{run}/no/page.html"), "cannot write to"),
         (("{run}/nowhere",), "is not the directory of a run"),

@@ -347,9 +347,10 @@ def test_the_entry_point_at_toy_size(tmp_path, capsys):
     [
         (["--discount", "1"], "--discount is 1.0, but must be above 0 and below 1."),
         (["--tolerance", "0"], "--tolerance is 0.0, but must be a positive number."),
-        (["--iterations", "5"], "--iterations must be at least 20, to fit a rate."),
-        (["--seeds", "1", "--few-seeds", "1"], "--seeds must be at least 2"),
-        (["--seed", "-1"], "--seed must be 0 or more"),
+        (["--iterations", "5"], "--iterations is 5, but must be at least 20, to fit a rate."),
+        (["--seeds", "1", "--few-seeds", "1"], "--seeds is 1, but must be at least 2"),
+        (["--few-seeds", "21"], "--few-seeds is 21, but must be from 1 to --seeds = 20."),
+        (["--seed", "-1"], "--seed is -1, but must be 0 or more"),
         (["--mdp", "nowhere.npz"], "--mdp nowhere.npz cannot be read"),
         (["--out", "."], ". is a folder: name a file."),
         (["--out", f"{__file__}/theory.json"], f"cannot make the folder {__file__}"),
@@ -357,7 +358,8 @@ def test_the_entry_point_at_toy_size(tmp_path, capsys):
     ],
 )
 def test_bad_flags_are_one_sentence(flags, sentence):
-    with pytest.raises(errors.UsageError, match=sentence.replace(".", r"\.")):
+    mistake = (errors.UsageError, errors.ConfigError)
+    with pytest.raises(mistake, match=sentence.replace(".", r"\.")):
         theory.main(flags)
 
 

@@ -12,7 +12,7 @@ from maxent_jax import errors
 from maxent_jax.analysis.run import Run
 from maxent_jax.checks import check_path, check_whole
 from maxent_jax.precision import in_32_bits
-from maxent_jax.runs import checkpoint, files, integrity
+from maxent_jax.runs import checkpoint, files
 
 
 @in_32_bits
@@ -40,11 +40,11 @@ def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> R
             f"{'seed' if config.num_seeds == 1 else 'seeds'}, counted from 0."
         )
     remedy = "load_run(..., fallback=True), or --fallback of a command, uses the one before"
-    name, passed_over = integrity.find(directory, whole=False, fallback=fallback, remedy=remedy)
+    name, results, rows, passed_over = checkpoint.restore_latest(
+        directory, config, remedy, fallback
+    )
     for sentence in passed_over.values():
         warnings.warn(sentence, stacklevel=2)
-    results = checkpoint.restore_results(directory, name, config)
-    rows = checkpoint.read_progress(directory, name)[0].rows
     if config.num_seeds > 1:
         results = jax.tree.map(lambda x: x[seed_index], results)
         rows = [files.of_seed(row, seed_index) for row in rows]

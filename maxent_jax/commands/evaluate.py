@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from maxent_jax import errors
 from maxent_jax.checks import check_seed
 from maxent_jax.commands import cli
 from maxent_jax.runs import atomic, files, integrity, runtime
@@ -50,8 +49,7 @@ def main(argv: Sequence[str]) -> None:
     """
     cli.import_modules(argv)
     arguments = cli.parse(Arguments, argv, "evaluate")
-    if arguments.episodes < 1:
-        raise errors.UsageError("--episodes must be at least 1.")
+    cli.check_least("--episodes", arguments.episodes)
     check_seed("--seed", arguments.seed)
     config = files.read_config(arguments.directory)
     config.check_registered()

@@ -85,22 +85,23 @@ def _check(arguments: Arguments, num_policies: int) -> None:
             policy is not None and not 0 <= policy < num_policies,
             f"--policy is {policy}, but the run has policies 0 to {num_policies - 1}.",
         ),
-        (arguments.episodes < 1, "--episodes must be at least 1."),
         (
             arguments.speed is not None and not 0.01 <= arguments.speed <= 1000,
-            "--speed must be from 0.01 to 1,000.",
+            f"--speed is {arguments.speed}, but must be from 0.01 to 1,000.",
         ),
         (
             not smallest <= arguments.size <= largest or arguments.size % 4,
-            f"--size must be a multiple of 4 from {smallest} to {largest:,}.",
+            f"--size is {arguments.size}, but must be a multiple of 4 from {smallest} to "
+            f"{largest:,}.",
         ),
         (
             not 1 <= arguments.stills <= MOST_STILLS,
-            f"--stills must be from 1 to {MOST_STILLS}.",
+            f"--stills is {arguments.stills}, but must be from 1 to {MOST_STILLS}.",
         ),
     ):
         if wrong:
             raise errors.UsageError(sentence)
+    cli.check_least("--episodes", arguments.episodes)
     check_seed("--seed", arguments.seed)
 
 

@@ -74,8 +74,7 @@ def _check(arguments: Arguments) -> Path:
         raise errors.UsageError("no run is given: name the directory of one run, or of several.")
     if len(set(directories)) < len(directories):
         raise errors.UsageError("a directory is named twice: name each run once.")
-    if arguments.episodes < 1:
-        raise errors.UsageError("--episodes must be at least 1.")
+    cli.check_least("--episodes", arguments.episodes)
     check_seed("--seed", arguments.seed)
     here = directories[0] if len(directories) == 1 else Path()
     path = arguments.out or here / "report.html"

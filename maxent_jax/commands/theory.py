@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from maxent_jax import errors
+from maxent_jax.checks import check_seed
 from maxent_jax.commands import cli, trajectories
 from maxent_jax.runs import atomic, files, progress, runtime
 from maxent_jax.visual import headless
 
 FITTED = ("river swim", "Garnet", "double chain", "four rooms", "open grid")
 PLAIN = ("river swim", "Garnet", "double chain", "small rooms")  # where an iteration is cheap
+FEWEST = 20  # iterations for the fit of the rate
 ON_GRIDS = 300  # iterations of the comparison in the other MDPs
 PLANNING_BUDGET, TOY_BUDGET = 4096, 16
 SAMPLES, TOY_SAMPLES = (1_000, 10_000, 100_000), (500, 1_000)
@@ -132,15 +134,24 @@ def _check(arguments: Arguments) -> Arguments:
             not 0 < arguments.tolerance < float("inf"),
             f"--tolerance is {arguments.tolerance}, but must be a positive number.",
         ),
-        (arguments.iterations < 20, "--iterations must be at least 20, to fit a rate."),
         (
-            not 1 <= arguments.few_seeds <= arguments.seeds or arguments.seeds < 2,
-            "--seeds must be at least 2, and --few-seeds from 1 to --seeds.",
+            arguments.iterations < FEWEST,
+            f"--iterations is {arguments.iterations}, but must be at least {FEWEST}, to fit a "
+            f"rate.",
         ),
-        (not 0 <= arguments.seed < 2**31, "--seed must be 0 or more, and below 2^31."),
+        (
+            arguments.seeds < 2,
+            f"--seeds is {arguments.seeds}, but must be at least 2, for an interval.",
+        ),
+        (
+            not 1 <= arguments.few_seeds <= arguments.seeds,
+            f"--few-seeds is {arguments.few_seeds}, but must be from 1 to --seeds = "
+            f"{arguments.seeds}.",
+        ),
     ):
         if wrong:
             raise errors.UsageError(sentence)
+    check_seed("--seed", arguments.seed)
     return arguments
 
 

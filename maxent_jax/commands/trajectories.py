@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from maxent_jax import errors
+from maxent_jax.checks import check_seed
 from maxent_jax.commands import cli
 from maxent_jax.runs import atomic, files, progress, runtime
 
@@ -70,10 +70,8 @@ def _check(arguments: Arguments) -> Arguments:
     if arguments.toy:
         arguments = dataclasses.replace(arguments, iterations=10, episodes=200, seeds=2)
     for name in ("iterations", "episodes", "seeds"):
-        if getattr(arguments, name) < 1:
-            raise errors.UsageError(f"--{name} must be at least 1.")
-    if not 0 <= arguments.seed < 2**31:
-        raise errors.UsageError("--seed must be 0 or more, and below 2^31.")
+        cli.check_least(f"--{name}", getattr(arguments, name))
+    check_seed("--seed", arguments.seed)
     return arguments
 
 

@@ -132,6 +132,37 @@ def restore(run_directory: Path, name: str, config: Config, placed: State | None
     return _as_computed(rest._replace(archive=results.archive, learner=learner), shapes, placed)
 
 
+class Latest(NamedTuple):
+    """What analysis needs of a run's latest checkpoint."""
+
+    name: str
+    results: Results
+    rows: list[dict[str, Any]]  # as in metrics.jsonl
+    passed_over: dict[str, str]  # by name, a sentence on each damaged checkpoint
+
+
+def restore_latest(
+    run_directory: Path, config: Config, remedy: str, fallback: bool = False
+) -> Latest:
+    """Restores the results of the latest checkpoint, also while the run trains and removes it.
+
+    Args:
+      remedy, fallback: as in `integrity.find`.
+    Raises:
+      CheckpointError: the run has no checkpoint, or it does not hold results of this config.
+      CheckpointCorruptError: as in `integrity.find`.
+    """
+    name, passed_over = integrity.find(run_directory, False, fallback, remedy)
+    try:
+        results = restore_results(run_directory, name, config)
+        rows = read_progress(run_directory, name)[0].rows
+    except Exception:
+        if (run_directory / FOLDER / name).exists():
+            raise
+        return restore_latest(run_directory, config, remedy, fallback)
+    return Latest(name, results, rows, passed_over)
+
+
 def restore_results(run_directory: Path, name: str, config: Config) -> Results:
     """Restores the archive and visits of a checkpoint, without the replay.
 
