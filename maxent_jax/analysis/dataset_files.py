@@ -4,8 +4,8 @@
     exorl    buffer/*.npz: an episode each, as in ExORL (github.com/denisyarats/exorl) and URLB
     minari   a dataset of Minari's, in the controls of Gymnasium's environment
 
-dataset.json says what the directory holds, and whether it is complete. Writing that was stopped
-goes on where it was.
+dataset.json says what the directory holds, and whether it is complete. A dataset that was stopped
+is continued where it ended.
 """
 
 import contextlib

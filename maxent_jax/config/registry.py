@@ -150,7 +150,7 @@ def _metra() -> MethodRow:
     return row._replace(settings={**row.settings, **own})
 
 
-TASK = "task"  # the method that is paid by a task alone
+TASK = "task"  # the method whose only reward is a task's
 
 METHODS = {
     "h": MethodRow("geometric", 0, "mixture", "scratch"),

@@ -125,9 +125,9 @@ def restore(run_directory: Path, name: str, config: Config, placed: State | None
     shapes = _shapes(config)
     wanted = _items(_abstract(shapes, placed))
     held = _held(run_directory, name)
-    wanted["rest"] = _less(wanted["rest"], held)
+    wanted["rest"] = _held_part(wanted["rest"], held)
     items = _load(run_directory, name, wanted)
-    results, rest = items["results"], _more(items["rest"], shapes, placed)
+    results, rest = items["results"], _completed(items["rest"], shapes, placed)
     learner = rest.learner._replace(visits=results.visits, random_visits=results.random_visits)
     return _as_computed(rest._replace(archive=results.archive, learner=learner), shapes, placed)
 
@@ -186,8 +186,8 @@ def _held(run_directory: Path, name: str) -> Mapping[str, Any]:
     return ocp.checkpointables_metadata(path).metadata["rest"]["learner"]
 
 
-def _less(rest: State, held: Mapping[str, Any]) -> State:
-    """What the checkpoint holds of the state: Orbax insists on the presence and shape of all."""
+def _held_part(rest: State, held: Mapping[str, Any]) -> State:
+    """The part of the state that the checkpoint holds: Orbax accepts no missing or other arrays."""
 
     def kept(fields: Any, those: Mapping[str, Any]) -> Any:
         return {name: x for name, x in fields._asdict().items() if name in those}
@@ -200,7 +200,7 @@ def _less(rest: State, held: Mapping[str, Any]) -> State:
         share = jax.ShapeDtypeStruct(shape, share.dtype, sharding=share.sharding)
         episodes = episodes._replace(restarts=episodes.restarts._replace(share=share))
     plane: Any = learner.plane
-    if plane is None and held.get("plane") is not None:  # read, and dropped by `_more`
+    if plane is None and held.get("plane") is not None:  # read, and dropped by `_completed`
         where = learner.env_steps.sharding
         plane = jax.ShapeDtypeStruct(held["plane"].shape, jnp.bool_, sharding=where)
     learner = learner._replace(
@@ -213,8 +213,8 @@ def _less(rest: State, held: Mapping[str, Any]) -> State:
     return rest._replace(learner=kept(learner, held))
 
 
-def _more(rest: State, shapes: State, placed: State | None) -> State:
-    """The state of which `_less` gave a part.
+def _completed(rest: State, shapes: State, placed: State | None) -> State:
+    """The whole state, from the part that `_held_part` describes.
 
     A checkpoint without a plane begins an empty one. Where positions are not metres there is none,
     whatever the checkpoint holds: older releases took them for metres in any environment.

@@ -33,7 +33,7 @@ class Claim(NamedTuple):
         directory = self.directory
         try:
             _check_writable(directory)
-            if not directory.exists() or (directory.is_dir() and _is_nobodys(directory)):
+            if not directory.exists() or (directory.is_dir() and _is_free(directory)):
                 return
         except OSError as error:
             raise UsageError(f"cannot write to {directory}: {error.strerror}.") from None
@@ -82,14 +82,14 @@ def _check_writable(directory: Path) -> None:
         raise UsageError(f"cannot write to {directory}: {place} is not writable.")
 
 
-def _is_nobodys(directory: Path) -> bool:
+def _is_free(directory: Path) -> bool:
     """Whether it holds only what a run leaves that ended before its first checkpoint."""
     if integrity.checkpoints(directory):
         return False
-    return all(_is_of_a_beginning(path) for path in directory.iterdir())
+    return all(_precedes_checkpoints(path) for path in directory.iterdir())
 
 
-def _is_of_a_beginning(path: Path) -> bool:
+def _precedes_checkpoints(path: Path) -> bool:
     directory = path.parent
     if path.name == files.CONFIG and path.is_file():
         return files.is_config(path)
