@@ -279,10 +279,8 @@ def _finish(figure: Figure, run: Run) -> Figure:
     """Adds a title and, below, every departure from the paper by name."""
     config = run.config
     task = config.downstream.task
-    on_task = "" if task == tasks.NONE else f", task {task}"
-    figure.suptitle(
-        f"{config.title}, {config.env}{on_task}, preset {config.preset}, seed {run.seed}"
-    )
+    where = config.env if task == tasks.NONE else f"{config.env}, task {task}"
+    figure.suptitle(f"{config.title}, {where}, preset {config.preset}, seed {run.seed}")
     named = ", ".join(f"{name}={config[name]}" for name in config.deviations())
     figure.supxlabel(f"departs from the paper in: {named or 'nothing'}", fontsize=6, wrap=True)
     return figure
