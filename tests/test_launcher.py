@@ -140,7 +140,7 @@ def test_a_job_that_the_cluster_refuses_is_one_sentence(tmp_path, slurm, monkeyp
 
 
 def test_of_a_finished_study_nothing_is_submitted(tmp_path, slurm, monkeypatch):
-    monkeypatch.setattr(protocol, "finished", lambda *_: True)
+    monkeypatch.setattr(disk, "finished", lambda *_: True)
     done = submitted(tmp_path, "--slurm", "time=60")
     assert done.stdout.startswith("all 3 cells are finished, so no job is submitted.")
     assert not (slurm / "script").exists()
@@ -168,7 +168,7 @@ def test_a_worker_waits_for_what_another_trains_and_others_start_from(tmp_path, 
         done.extend([] if dies else names[:1])
 
     monkeypatch.setattr(reproduce.time, "sleep", other_ends)
-    monkeypatch.setattr(protocol, "finished", lambda _, cell: cell.name in done)
+    monkeypatch.setattr(disk, "finished", lambda _, cell: cell.name in done)
     monkeypatch.setattr(training, "run_to_end", lambda config, at, *_: done.append(at.name))
     other.__enter__()
     assert reproduce._train(tmp_path, cells) == 0
@@ -178,7 +178,7 @@ def test_a_worker_waits_for_what_another_trains_and_others_start_from(tmp_path, 
 def test_a_worker_ends_while_another_trains_the_last_cell(tmp_path, monkeypatch):
     cells, trained = protocol.make("fig4", "toy", 1), []
     monkeypatch.setattr(training, "run_to_end", lambda config, at, *_: trained.append(at.name))
-    monkeypatch.setattr(protocol, "finished", lambda _, cell: cell.name in trained)
+    monkeypatch.setattr(disk, "finished", lambda _, cell: cell.name in trained)
     monkeypatch.setattr(reproduce.time, "sleep", None)
     with locks.holding(tmp_path / cells[0].name):
         assert reproduce._train(tmp_path, cells) == 0
