@@ -43,7 +43,7 @@ def remove(run_directory: Path, name: str) -> None:
 
 
 def clear_unfinished(run_directory: Path) -> None:
-    """Removes what a killed process had not finished to write, or to remove."""
+    """Removes what a killed process did not finish writing, or removing."""
     for path in (run_directory / FOLDER).glob(f"{UNFINISHED}*"):
         shutil.rmtree(path)
 
