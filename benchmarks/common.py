@@ -36,9 +36,16 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     flags = argparse.ArgumentParser(description=description)
     flags.add_argument("--toy", action="store_true", help="check that it runs, with tiny sizes")
     flags.add_argument(
-        "--repeats", type=int, default=REPEATS, help="number of measurements; the median counts"
+        "--repeats", type=positive, default=REPEATS, help="measurements, of which the median counts"
     )
     return flags
+
+
+def positive(word: str) -> int:
+    """Returns the value of a flag that must be a whole number of at least 1."""
+    if not word.isdecimal() or int(word) < 1:
+        raise argparse.ArgumentTypeError(f"is {word}, but must be a whole number of at least 1")
+    return int(word)
 
 
 def print_versions(peers: Iterable[Peer] = ()) -> None:

@@ -21,6 +21,7 @@ from mujoco import rollout
 
 from benchmarks import common
 from maxent_jax import envs
+from maxent_jax.analysis.gymnasium_play import IDS
 from maxent_jax.config import Config
 from maxent_jax.config.registry import PHYSICS
 from maxent_jax.envs import base, physics
@@ -32,7 +33,6 @@ SETTLE_STEPS = {"ant": 40, "walker2d": 5, "humanoid": 5}
 MIN_STEPS = DRIFT_STEPS = 50  # of each env
 MUJOCO_STEPS = 6400  # of all envs together, at least; C MuJoCo is too fast to time fewer
 SEED = 0
-GYMNASIUM = {"ant": "Ant-v4", "walker2d": "Walker2d-v4", "humanoid": "Humanoid-v4"}
 
 
 class Workload(NamedTuple):
@@ -159,14 +159,14 @@ def in_control_range(model: mujoco.MjModel, actions: np.ndarray) -> np.ndarray:
 def gymnasium_sync(gymnasium, workload: Workload, repeats: int) -> Measurement:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # v4 is what the paper used
-        name = GYMNASIUM[workload.env.task.name]
+        name = IDS[workload.env.task.name]
         env = gymnasium.make_vec(name, workload.actions.shape[1], vectorization_mode="sync")
     return stepped(env, workload, repeats)
 
 
 def envpool_threads(envpool, workload: Workload, repeats: int) -> Measurement:
     num_envs = workload.actions.shape[1]
-    name = GYMNASIUM[workload.env.task.name]
+    name = IDS[workload.env.task.name]
     env = envpool.make_gymnasium(name, num_envs=num_envs, num_threads=common.CORES)
     return stepped(env, workload, repeats)
 
@@ -256,7 +256,7 @@ def measure(cases, peers, repeats: int) -> Iterator[dict[str, Any]]:
 
 def main() -> None:
     flags = common.parser(__doc__)
-    flags.add_argument("--env", nargs="*", choices=list(GYMNASIUM), default=list(GYMNASIUM))
+    flags.add_argument("--env", nargs="*", choices=list(IDS), default=list(IDS))
     flags.add_argument("--mujoco-envs", type=int, nargs="*", default=[16, 128, 1024])
     flags.add_argument("--mjx-envs", type=int, nargs="*", default=[64, 256])
     flags.add_argument("--warp-envs", type=int, nargs="*", default=[])

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 from benchmarks import common
 from maxent_jax.config import preset
-from maxent_jax.runs import files
+from maxent_jax.runs import atomic, files
 
 # The changes of each regime to the preset.
 REGIMES: dict[str, dict[str, Any]] = {
@@ -122,7 +122,7 @@ def run(name: str, seed: int, base: dict[str, Any], cores: set[int]) -> dict[str
 def held_by(out: Path, base: dict[str, Any]) -> dict[str, Any] | None:
     """Returns the content of --out, without rows if it is new; None if its settings were others."""
     # All of the preset's: it may have changed since.
-    settings = files.jsonable(preset(base["preset"], **base).flat())
+    settings = atomic.jsonable(preset(base["preset"], **base).flat())
     if not out.exists():
         return {"base": settings, "rows": []}
     held = json.loads(out.read_text(encoding="utf-8"))
@@ -161,7 +161,7 @@ def study(names, seeds, base, jobs: int, out: Path, held) -> Iterator[dict[str, 
                 continue
             row = future.result()
             done.append(row)
-            files.write_json(out, held)
+            atomic.write_json(out, held)
             yield row
     if failed:
         raise RuntimeError(f"{failed} runs failed; the rows of the others are in {out}")

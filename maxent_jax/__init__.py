@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from maxent_jax.analysis import Run, load_run
-    from maxent_jax.commands.train import train
     from maxent_jax.config import Config, preset
+    from maxent_jax.training import train
 
 __version__ = "0.1.0"
 __all__ = ["Config", "Run", "load_run", "preset", "train"]
@@ -19,7 +19,7 @@ _MODULES = {
     "Run": "analysis",
     "load_run": "analysis",
     "preset": "config",
-    "train": "commands.train",
+    "train": "training",
 }
 
 

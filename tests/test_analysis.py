@@ -21,7 +21,7 @@ from maxent_jax.commands import evaluate
 from maxent_jax.config import preset
 from maxent_jax.errors import ConfigError
 from maxent_jax.moments import Moments
-from maxent_jax.runs import files
+from maxent_jax.runs import checkpoint, files, integrity
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +54,32 @@ def test_a_metric_of_more_axes_is_named_by_its_indices(run):
     frame = dataclasses.replace(run, metrics={"cube": cube}).frame()
     assert [*frame] == [f"cube_{i}_{j}" for i in range(2) for j in range(3)]
     np.testing.assert_array_equal(frame["cube_1_2"], cube[:, 1, 2])
+
+
+def test_a_run_that_trains_meanwhile_is_loaded(copy_of_smoke_run, monkeypatch):
+    restore = checkpoint.restore_results
+
+    def slow(directory, name, config):
+        if name == "2":  # saved again and again meanwhile, as "3" and "4"
+            integrity.remove(directory, "2")
+        return restore(directory, name, config)
+
+    monkeypatch.setattr(checkpoint, "restore_results", slow)
+    assert maxent_jax.load_run(copy_of_smoke_run).checkpoint == "1"
+
+
+def test_a_column_that_an_older_release_did_not_measure_is_there(copy_of_smoke_run):
+    folder = copy_of_smoke_run / integrity.FOLDER / "2"
+    rows = files.read_metrics(folder)
+    last = {name: rows[-1][name] for name in ("cells_1m", "segment_reward")}
+    for name in last:
+        del rows[0][name]
+    files.write_metrics(folder, rows)
+    (folder / integrity.MANIFEST).unlink()
+    integrity.seal(folder)
+    metrics = maxent_jax.load_run(copy_of_smoke_run).metrics
+    for name, value in last.items():
+        np.testing.assert_array_equal(metrics[name], [np.full_like(value, np.nan, float), value])
 
 
 def test_a_frame_without_pandas_is_one_sentence(run, monkeypatch):

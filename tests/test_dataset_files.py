@@ -170,7 +170,7 @@ def test_the_command_writes_and_says_so(smoke_run, tmp_path):
     ("flags", "sentence"),
     [
         (("--format", "hdf5"), "unknown format 'hdf5'"),
-        (("--transitions", "0"), "--transitions must be at least 1"),
+        (("--transitions", "0"), "--transitions is 0, but must be at least 1."),
         (("--task", "flip"), "task is flip, but ant has only"),
         (("--task", "user:nobody"), "task 'user:nobody' is not registered"),
         (("--seed-index", "1"), "seed_index is 1, but"),

@@ -5,9 +5,10 @@ import json
 
 import pytest
 
-from maxent_jax.commands import reproduce, train
+from maxent_jax import training
+from maxent_jax.commands import reproduce
 from maxent_jax.runs import files
-from maxent_jax.studies import downstream, paper_figures, protocol
+from maxent_jax.studies import disk, downstream, paper_figures, protocol
 
 
 def cells_of(scale, num_seeds=1):
@@ -73,7 +74,7 @@ def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("studies")
     of_v = protocol.STUDIES["downstream"]._replace(methods={"V": {"method": "v"}})
     argv = ["downstream", "--scale", "toy", "--seeds", "1", "--out", str(out)]
-    whole = train.run_to_end
+    whole = training.run_to_end
 
     def only_v(config, directory, *rest):
         if config.downstream.source:
@@ -82,10 +83,10 @@ def finished(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(protocol.STUDIES, "downstream", of_v)
-        patch.setattr(train, "run_to_end", only_v)
+        patch.setattr(training, "run_to_end", only_v)
         with pytest.raises(KeyboardInterrupt):
             reproduce.main(argv)
-        patch.setattr(train, "run_to_end", whole)
+        patch.setattr(training, "run_to_end", whole)
         moved = out.parent / "moved"
         out.rename(moved)
         reproduce.main([*argv[:-1], str(moved)])
@@ -100,7 +101,7 @@ def test_a_stopped_study_of_tasks_goes_on(finished):
         "pendulum-V-1-gymnasium-0",
         "pendulum-V-2-gymnasium-0",
     ]
-    assert all(protocol.finished(directory, cell) for cell in cells)
+    assert all(disk.finished(directory, cell) for cell in cells)
     played = [
         len(json.loads((directory / cell.name / files.FIRST).read_text())["task_return"])
         for cell in cells[2:]
@@ -131,7 +132,7 @@ def test_what_starts_from_a_failed_cell_is_left_out(finished, tmp_path, monkeypa
         raise errors.NonFiniteError("the loss is not finite.")
 
     _, cells = finished
-    monkeypatch.setattr(train, "run_to_end", fail)
+    monkeypatch.setattr(training, "run_to_end", fail)
     assert reproduce._train(tmp_path / "downstream", cells) == 2
     assert begun == ["pendulum-V-0", "pendulum-scratch-gymnasium-0"]
 

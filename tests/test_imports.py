@@ -14,18 +14,9 @@ PACKAGE = Path(maxent_jax.__file__).parent
 # The reading order of the package's folders and single modules, first to last.
 ORDER = (
     *("errors", "checks", "types", "precision", "moments", "config", "native", "density", "envs"),
-    *(
-        "tasks",
-        "rollout",
-        "features",
-        "rewards",
-        "sac",
-        "intrinsic",
-        "components",
-        "mixture",
-        "algorithm",
-    ),
-    *("baselines", "runs", "analysis", "visual", "theory", "studies", "commands", "__main__"),
+    *("tasks", "rollout", "features", "rewards", "sac", "intrinsic", "components", "mixture"),
+    *("algorithm", "baselines", "runs", "analysis", "visual", "training", "theory", "studies"),
+    *("commands", "__main__"),
 )
 
 

@@ -6,6 +6,7 @@ import subprocess
 import pytest
 
 from maxent_jax import errors
+from maxent_jax.commands import verify
 from maxent_jax.runs import files, integrity
 from maxent_jax.runs.integrity import FOLDER, MANIFEST
 
@@ -38,6 +39,35 @@ def test_checkpoints_are_ordered_by_how_far_they_are(run):
     assert integrity.checkpoints(run) == ["2+11", "9", "10", "10+0", "10+2"]
     integrity.clear_unfinished(run)
     assert not (run / FOLDER / "unfinished-11").exists()
+
+
+def test_a_removal_that_is_interrupted_leaves_no_damaged_checkpoint(run, monkeypatch):
+    def interrupted(path, *_, **__):
+        if path.exists():
+            (path / files.CONFIG).unlink()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(integrity.shutil, "rmtree", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        integrity.remove(run, "9")
+    monkeypatch.undo()
+    assert integrity.checkpoints(run) == ["10+2"] and not list(integrity.damages(run, "10+2"))
+    integrity.clear_unfinished(run)
+    assert [path.name for path in (run / FOLDER).iterdir()] == ["10+2"]
+
+
+def test_a_checkpoint_that_its_run_removes_meanwhile_is_not_damaged(run, monkeypatch, capsys):
+    checksum = integrity.checksum
+
+    def slow(path, to_disk=False):
+        if (run / FOLDER / "9").exists():
+            integrity.remove(run, "9")
+        return checksum(path, to_disk)
+
+    monkeypatch.setattr(integrity, "checksum", slow)
+    assert verify.verify(run, ["9", "10+2"])
+    printed = capsys.readouterr().out
+    assert "checkpoint 9: removed meanwhile" in printed and "checkpoint 10+2: intact" in printed
 
 
 def test_analysis_passes_by_what_it_does_not_read(run):

@@ -11,10 +11,11 @@ import commands
 import pytest
 import submitit
 
-from maxent_jax.commands import launcher, reproduce, train
+from maxent_jax import training
+from maxent_jax.commands import launcher, reproduce
 from maxent_jax.runs import files, locks
 from maxent_jax.runs.signals import Interrupted
-from maxent_jax.studies import protocol
+from maxent_jax.studies import disk, protocol
 
 TOY = ["--scale", "toy", "--seeds", "1"]
 JOB = "77"
@@ -139,7 +140,7 @@ def test_a_job_that_the_cluster_refuses_is_one_sentence(tmp_path, slurm, monkeyp
 
 
 def test_of_a_finished_study_nothing_is_submitted(tmp_path, slurm, monkeypatch):
-    monkeypatch.setattr(protocol, "finished", lambda *_: True)
+    monkeypatch.setattr(disk, "finished", lambda *_: True)
     done = submitted(tmp_path, "--slurm", "time=60")
     assert done.stdout.startswith("all 3 cells are finished, so no job is submitted.")
     assert not (slurm / "script").exists()
@@ -167,8 +168,8 @@ def test_a_worker_waits_for_what_another_trains_and_others_start_from(tmp_path, 
         done.extend([] if dies else names[:1])
 
     monkeypatch.setattr(reproduce.time, "sleep", other_ends)
-    monkeypatch.setattr(protocol, "finished", lambda _, cell: cell.name in done)
-    monkeypatch.setattr(train, "run_to_end", lambda config, at, *_: done.append(at.name))
+    monkeypatch.setattr(disk, "finished", lambda _, cell: cell.name in done)
+    monkeypatch.setattr(training, "run_to_end", lambda config, at, *_: done.append(at.name))
     other.__enter__()
     assert reproduce._train(tmp_path, cells) == 0
     assert done == names and waited == [reproduce.POLL_SECONDS]
@@ -176,8 +177,8 @@ def test_a_worker_waits_for_what_another_trains_and_others_start_from(tmp_path, 
 
 def test_a_worker_ends_while_another_trains_the_last_cell(tmp_path, monkeypatch):
     cells, trained = protocol.make("fig4", "toy", 1), []
-    monkeypatch.setattr(train, "run_to_end", lambda config, at, *_: trained.append(at.name))
-    monkeypatch.setattr(protocol, "finished", lambda _, cell: cell.name in trained)
+    monkeypatch.setattr(training, "run_to_end", lambda config, at, *_: trained.append(at.name))
+    monkeypatch.setattr(disk, "finished", lambda _, cell: cell.name in trained)
     monkeypatch.setattr(reproduce.time, "sleep", None)
     with locks.holding(tmp_path / cells[0].name):
         assert reproduce._train(tmp_path, cells) == 0
@@ -191,7 +192,7 @@ def test_a_signal_in_a_cells_last_iteration_stops_the_study(tmp_path, monkeypatc
         trained.append(directory.name)
         return signal.SIGTERM
 
-    monkeypatch.setattr(train, "run_to_end", stopped_too_late)
+    monkeypatch.setattr(training, "run_to_end", stopped_too_late)
     with pytest.raises(Interrupted, match="SIGTERM"):
         reproduce._train(tmp_path, protocol.make("fig4", "toy", 1))
     assert len(trained) == 1
@@ -236,7 +237,7 @@ def test_a_study_whose_workers_are_killed_ends_as_one_that_was_not(tmp_path):
     executor = submitit.LocalExecutor(tmp_path / "jobs")
     executor.update_parameters(timeout_min=30, stderr_to_stdout=True)
     rng, kills = random.Random(0), 0
-    while not all(protocol.finished(out, cell) for cell in cells):
+    while not all(disk.finished(out, cell) for cell in cells):
         jobs = launcher.submit(executor, [*study, "--out", str(out.parent)], 2)
         rng.shuffle(jobs)
         target = num_rows(out) + rng.randint(1, 6)
@@ -269,7 +270,7 @@ def test_a_job_whose_time_is_over_saves_and_is_requeued(tmp_path, slurm, monkeyp
     assert log.count("stopping at the next checkpoint") == 1
     assert f"Requeued job {JOB}_{first} " in log
     assert log.count("Starting with JobEnvironment") == 2
-    assert all(protocol.finished(tmp_path / "downstream", cell) for cell in cells)
+    assert all(disk.finished(tmp_path / "downstream", cell) for cell in cells)
     rows = rows_of(tmp_path / "downstream")
     assert list(rows) == sorted(cell.name for cell in cells)
     assert all([row["iteration"] for row in of_cell] == [1, 2] for of_cell in rows.values())

@@ -40,3 +40,13 @@ def test_without_a_terminal_there_is_a_line_an_iteration(monkeypatch, capsys):
         ", about 0 s left"
     )
     assert lines[2:] == [""]
+
+
+@pytest.mark.parametrize("lost", [None, [3.0, None]])
+def test_a_return_that_is_not_finite_ends_no_run(monkeypatch, capsys, lost):
+    """metrics.jsonl holds null for it: a user's task may reward a state with NaN."""
+    row = {"task_return": lost, "task_success": lost, "wall_seconds": 1.0}
+    monkeypatch.setenv("TTY_COMPATIBLE", "0")
+    with Bar(preset("smoke"), 0, 0, row) as bar:
+        bar.iteration_done(row)
+    assert "return nan" in capsys.readouterr().err

@@ -12,13 +12,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from maxent_jax import errors
-from maxent_jax.commands import reproduce, train
+from maxent_jax import errors, training
+from maxent_jax.commands import reproduce
 from maxent_jax.config import preset
 from maxent_jax.errors import ConfigError
 from maxent_jax.features import make_feature_map
-from maxent_jax.runs import files
-from maxent_jax.studies import paper_figures, protocol, results, values
+from maxent_jax.runs import atomic, files
+from maxent_jax.studies import disk, paper_figures, protocol, results, values
 from maxent_jax.studies.protocol import Cell
 
 TOY = ["--scale", "toy", "--seeds", "1"]
@@ -128,40 +128,40 @@ def test_a_directory_belongs_to_one_study_and_may_gain_seeds(tmp_path):
     one, two = (protocol.make("fig4", "cpu", seeds) for seeds in (1, 2))
     directory.mkdir()
     (directory / "study.tmp.json").write_text("{")  # of a process that was killed in its first step
-    protocol.claim(directory, "fig4", "cpu", two)
-    protocol.claim(directory, "fig4", "cpu", one)
-    held = json.loads((directory / protocol.STUDY).read_text())
+    disk.claim(directory, "fig4", "cpu", two)
+    disk.claim(directory, "fig4", "cpu", one)
+    held = json.loads((directory / disk.STUDY).read_text())
     assert set(held["cells"]) == {cell.name for cell in two}
 
     changed = [one[0]._replace(config=one[0].config.replace(eta=0.5))]
     with pytest.raises(errors.UsageError, match=r"eta was 0\.1 and is 0\.5; choose another --out"):
-        protocol.claim(directory, "fig4", "cpu", changed)
+        disk.claim(directory, "fig4", "cpu", changed)
     with pytest.raises(errors.UsageError, match="scale is cpu, not paper"):
-        protocol.claim(directory, "fig4", "paper", protocol.make("fig4", "paper"))
+        disk.claim(directory, "fig4", "paper", protocol.make("fig4", "paper"))
     name = one[0].name
     before = {key: value for key, value in held["cells"][name].items() if key != "stale_rewards"}
     earlier = held | {"cells": held["cells"] | {name: before}}  # of a release without that field
-    (directory / protocol.STUDY).write_text(json.dumps(earlier))
-    protocol.claim(directory, "fig4", "cpu", one)
+    (directory / disk.STUDY).write_text(json.dumps(earlier))
+    disk.claim(directory, "fig4", "cpu", one)
     stale = [one[0]._replace(config=one[0].config.replace(stale_rewards=True))]
-    (directory / protocol.STUDY).write_text(json.dumps(earlier))
+    (directory / disk.STUDY).write_text(json.dumps(earlier))
     with pytest.raises(errors.UsageError, match="stale_rewards was False and is True"):
-        protocol.claim(directory, "fig4", "cpu", stale)
-    (directory / protocol.STUDY).write_text(json.dumps(held | {"version": 0}))
+        disk.claim(directory, "fig4", "cpu", stale)
+    (directory / disk.STUDY).write_text(json.dumps(held | {"version": 0}))
     with pytest.raises(errors.UsageError, match="version is 0, not 1"):
-        protocol.claim(directory, "fig4", "cpu", one)
-    (directory / protocol.STUDY).write_text("{")
+        disk.claim(directory, "fig4", "cpu", one)
+    (directory / disk.STUDY).write_text("{")
     with pytest.raises(errors.UsageError, match="cannot be read"):
-        protocol.claim(directory, "fig4", "cpu", one)
+        disk.claim(directory, "fig4", "cpu", one)
     with pytest.raises(errors.UsageError, match="not empty"):
-        protocol.claim(tmp_path, "fig4", "cpu", one)
+        disk.claim(tmp_path, "fig4", "cpu", one)
 
 
 def test_processes_may_claim_a_directory_at_the_same_time(tmp_path):
     shares = [protocol.make("fig4", "cpu", seeds) for seeds in (1, 2, 3, 4) * 4]
     with ThreadPoolExecutor(16) as pool:
-        list(pool.map(lambda cells: protocol.claim(tmp_path / "s", "fig4", "cpu", cells), shares))
-    held = json.loads((tmp_path / "s" / protocol.STUDY).read_text())
+        list(pool.map(lambda cells: disk.claim(tmp_path / "s", "fig4", "cpu", cells), shares))
+    held = json.loads((tmp_path / "s" / disk.STUDY).read_text())
     assert set(held["cells"]) == {cell.name for cell in shares[3]}
 
 
@@ -169,7 +169,7 @@ def test_processes_may_claim_a_directory_at_the_same_time(tmp_path):
 def finished(tmp_path_factory):
     """fig5 at toy size, which needs the runs of fig4, stopped once in the middle; and the calls."""
     out, trained = tmp_path_factory.mktemp("studies"), []
-    whole = train.run_to_end
+    whole = training.run_to_end
 
     def until_the_second(config, directory, *rest):
         if len(trained) == 1:
@@ -183,10 +183,10 @@ def finished(tmp_path_factory):
 
     argv = ["fig5", *TOY, "--out", str(out)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train, "run_to_end", until_the_second)
+        patch.setattr(training, "run_to_end", until_the_second)
         with pytest.raises(KeyboardInterrupt):
             reproduce.main(argv)
-        patch.setattr(train, "run_to_end", all_of_it)
+        patch.setattr(training, "run_to_end", all_of_it)
         reproduce.main(argv)
         reproduce.main(["fig4", *TOY, "--out", str(out)])
     return out, trained
@@ -200,7 +200,7 @@ def test_a_stopped_study_repeats_no_finished_cell(finished):
 def test_a_run_that_another_study_has_is_not_trained_again(finished, monkeypatch):
     out, _ = finished
     trained = []
-    monkeypatch.setattr(train, "run_to_end", lambda config, at, *_: trained.append(at))
+    monkeypatch.setattr(training, "run_to_end", lambda config, at, *_: trained.append(at))
     for study in ("start", "weights", "refresh"):
         reproduce.main([study, *TOY, "--out", str(out), "--no-figures"])
     names = {directory.relative_to(out).as_posix() for directory in trained}
@@ -213,13 +213,13 @@ def test_a_run_that_another_study_has_is_not_trained_again(finished, monkeypatch
     assert theirs < cells and names == cells - theirs
 
     uniform = protocol.make("weights", "toy", 1)[0]
-    assert protocol.home(out / "weights", uniform) == out / "fig4" / "pendulum-V-0"
+    assert disk.home(out / "weights", uniform) == out / "fig4" / "pendulum-V-0"
     assert values.read(out / "weights", [uniform])[0]["method"] == "uniform"
     (out / "broken").mkdir()
-    (out / "broken" / protocol.STUDY).write_text("{")
-    assert protocol.home(out / "weights", uniform) == out / "fig4" / "pendulum-V-0"
+    (out / "broken" / disk.STUDY).write_text("{")
+    assert disk.home(out / "weights", uniform) == out / "fig4" / "pendulum-V-0"
     (out / "weights" / uniform.name).mkdir()
-    assert protocol.home(out / "weights", uniform) == out / "weights" / uniform.name
+    assert disk.home(out / "weights", uniform) == out / "weights" / uniform.name
 
 
 def test_a_finished_run_with_other_settings_is_no_cell(finished, monkeypatch, capsys):
@@ -231,7 +231,7 @@ def test_a_finished_run_with_other_settings_is_no_cell(finished, monkeypatch, ca
     content["config"]["eta"] = 0.5
     path.write_text(json.dumps(content))
     trained = []
-    monkeypatch.setattr(train, "run_to_end", lambda config, at, *_: trained.append(at))
+    monkeypatch.setattr(training, "run_to_end", lambda config, at, *_: trained.append(at))
     with pytest.raises(SystemExit) as stop:
         reproduce.main(["fig4", *TOY, "--out", str(out)])
     path.write_text(kept)
@@ -249,7 +249,7 @@ def test_a_cell_that_cannot_be_trained_does_not_keep_the_others_from_it(
         if len(trained) == 1:
             raise errors.NonFiniteError("the loss is not finite.")
 
-    monkeypatch.setattr(train, "run_to_end", fail_once)
+    monkeypatch.setattr(training, "run_to_end", fail_once)
     with pytest.raises(SystemExit) as stop:
         reproduce.main(["fig4", *TOY, "--out", str(tmp_path)])
     assert stop.value.code == 1
@@ -308,6 +308,15 @@ def test_environments_are_summarised_apart_and_never_confused():
         "near": 1.0,
         "MEPOL": 1.0,
     }
+
+
+def test_a_summary_counts_the_seeds_of_each_environment():
+    """As in fig4 at scale cpu: five seeds of Ant, three of Humanoid."""
+    names = ("env_steps", *results.SUMMARISED)
+    seeds = {"ant": 5, "humanoid": 3}
+    columns = {env: dict.fromkeys(names, np.ones((number, 2))) for env, number in seeds.items()}
+    groups = [(env, method, columns[env]) for env in columns for method in ("V", "H")]
+    assert results.summarise(groups)["seeds"] == seeds
 
 
 def test_what_methods_differ_in_as_a_number_is_an_axis():
@@ -428,7 +437,7 @@ def test_an_entropy_that_json_cannot_hold_is_the_lowest_of_all(tmp_path):
     files.append_metrics(tmp_path / cell.name, row)
     (found,) = values.read(tmp_path, [cell])
     assert found["mixture_knn_entropy"] == -np.inf and found["mixture_entropy"] == 1
-    files.write_csv(tmp_path / "raw.csv", values.COLUMNS, [found])
+    atomic.write_csv(tmp_path / "raw.csv", values.COLUMNS, [found])
     assert "-inf" in (tmp_path / "raw.csv").read_text()
 
 

@@ -112,7 +112,8 @@ def test_a_methods_settings_are_its_own(restored_tables):
     [
         (("", "last", 0, "mixture", "last"), "method's name is ''"),
         (("m", "lst", 0, "mixture", "last"), "unknown weights 'lst': did you mean 'last'"),
-        (("m", "last", -1, "mixture", "last"), "refresh_period is -1"),
+        (("m", "last", -1, "mixture", "last"), "refresh_period is -1, but must be 0 or more"),
+        (("m", "last", True, "mixture", "last"), "refresh_period is True, but must be a whole"),
         (("m", "last", 0, "mix", "last"), "unknown reference 'mix'"),
         (("m", "last", 0, "mixture", "first"), "unknown start 'first'"),
     ],

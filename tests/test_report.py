@@ -176,12 +176,22 @@ def test_the_comparison_draws_every_seed_in_its_runs_colour():
     assert figure.axes[0].get_ylim()[0] == 0 and figure.axes[0].get_ylim()[1] > 5
 
 
+def test_a_users_name_with_the_sign_of_a_formula_is_drawn(tmp_path):
+    run = untrained.make_run(num_iterations=1)
+    task = "user:$\\lost$"
+    names = (*(axis for axis, _ in plotting.COVERAGE_AXES), "task_return")
+    metrics = {name: plotting.np.array([3.0, 5.0]) for name in names}
+    run = dataclasses.replace(run, metrics=metrics, config=run.config.replace(task=task))
+    plotting.save(plotting._finish(plotting.Figure(), run), tmp_path, "titled")
+    plotting.save(plotting.comparison({task: [run]}), tmp_path, "compared")
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         ((), "name the directory of one run"),
         (("{run}", "{run}"), "named twice"),
-        (("{run}", "--episodes", "0"), "--episodes must be at least 1"),
+        (("{run}", "--episodes", "0"), "--episodes is 0, but must be at least 1"),
         (("{run}", "--out", "{run}"), "cannot write to"),
         (("{run}", "--out", "{run}/no/page.html"), "cannot write to"),
         (("{run}/nowhere",), "is not the directory of a run"),

@@ -12,7 +12,17 @@ import pytest
 from maxent_jax import errors, mixture
 from maxent_jax.commands import theory
 from maxent_jax.config.registry import METHODS, STARTS
-from maxent_jax.theory import bounds, loop, mdps, optimum, peers, reference, tabular
+from maxent_jax.theory import (
+    bounds,
+    loop,
+    mdps,
+    optimum,
+    peers,
+    reference,
+    tabular,
+    tabular_figures,
+    tabular_problems,
+)
 from maxent_jax.theory.loop import Settings
 
 GARNET = mdps.garnet(8, 3, 2, seed=2)
@@ -337,14 +347,19 @@ def test_the_entry_point_at_toy_size(tmp_path, capsys):
     [
         (["--discount", "1"], "--discount is 1.0, but must be above 0 and below 1."),
         (["--tolerance", "0"], "--tolerance is 0.0, but must be a positive number."),
-        (["--iterations", "5"], "--iterations must be at least 20, to fit a rate."),
-        (["--seeds", "1", "--few-seeds", "1"], "--seeds must be at least 2"),
-        (["--seed", "-1"], "--seed must be 0 or more"),
+        (["--iterations", "5"], "--iterations is 5, but must be at least 20, to fit a rate."),
+        (["--seeds", "1", "--few-seeds", "1"], "--seeds is 1, but must be at least 2"),
+        (["--few-seeds", "21"], "--few-seeds is 21, but must be from 1 to --seeds = 20."),
+        (["--seed", "-1"], "--seed is -1, but must be 0 or more"),
         (["--mdp", "nowhere.npz"], "--mdp nowhere.npz cannot be read"),
+        (["--out", "."], ". is a folder: name a file."),
+        (["--out", f"{__file__}/theory.json"], f"cannot make the folder {__file__}"),
+        (["--figures", __file__], f"cannot make the folder {__file__}"),
     ],
 )
 def test_bad_flags_are_one_sentence(flags, sentence):
-    with pytest.raises(errors.UsageError, match=sentence.replace(".", r"\.")):
+    mistake = (errors.UsageError, errors.ConfigError)
+    with pytest.raises(mistake, match=sentence.replace(".", r"\.")):
         theory.main(flags)
 
 
@@ -358,6 +373,29 @@ def test_an_mdp_of_ones_own_is_checked_before_anything_is_computed(tmp_path, row
     ):
         theory.main(["--mdp", str(tmp_path / "own.npz"), "--out", str(tmp_path / "theory.json")])
     assert not (tmp_path / "theory.json").exists()
+
+
+@pytest.mark.parametrize("content", ["empty", "half", "array"])
+def test_a_file_that_is_no_archive_is_one_sentence(tmp_path, content):
+    path = tmp_path / "own.npz"
+    np.savez(path, transitions=np.full((2, 1, 2), 0.5), start=np.eye(2)[0])
+    if content == "array":
+        with path.open("wb") as file:
+            np.save(file, np.eye(2))
+    else:
+        path.write_bytes(path.read_bytes()[: 100 if content == "half" else 0])
+    with pytest.raises(errors.UsageError, match=r"own\.npz is not an \.npz file: save it with"):
+        tabular_problems.read(path, 0.9)
+
+
+def test_the_results_of_an_mdp_of_ones_own_are_written(tmp_path, monkeypatch):
+    """The studies themselves take a minute: see the test of the whole command."""
+    monkeypatch.setattr(theory, "study", lambda arguments: {"settings": vars(arguments)})
+    monkeypatch.setattr(tabular_figures, "draw", lambda results, folder: [])
+    monkeypatch.setattr(theory, "_print", lambda results: None)
+    theory.main(["--mdp", "own.npz", "--out", str(tmp_path / "new" / "theory.json")])
+    held = json.loads((tmp_path / "new" / "theory.json").read_text())
+    assert held["settings"]["mdp"] == "own.npz"
 
 
 def test_the_exit_code_of_a_mistake_is_2_and_jax_is_not_loaded_for_it():

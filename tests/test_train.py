@@ -17,7 +17,7 @@ from commands import ROOT, call, in_subprocess
 import maxent_jax
 from benchmarks import common
 from benchmarks.gpu import parts
-from maxent_jax import envs, errors
+from maxent_jax import envs, errors, training
 from maxent_jax.commands import train
 from maxent_jax.config import preset
 from maxent_jax.runs import driver, files, integrity
@@ -120,7 +120,7 @@ def test_figures_are_drawn_anew_unless_nothing_was_trained(copy_of_smoke_run, mo
     for path in paths:
         path.write_bytes(b"by evaluate, while the run was training")
     monkeypatch.setattr(driver, "train", lambda *_: driver.Ended(trained))
-    train.run_to_end(preset("smoke"), directory, time.perf_counter(), driver.AS_USUAL)
+    training.run_to_end(preset("smoke"), directory, time.perf_counter(), driver.AS_USUAL)
     assert all(path.read_bytes().startswith(b"\x89PNG") == trained for path in paths)
 
 
@@ -196,7 +196,7 @@ def test_every_method_runs_on_both_backends(tmp_path, backend, method, period):
 def run_smoke(directory, env, backend, **changes):
     config = preset("smoke", env=env, backend=backend, num_iterations=1, **changes)
     with jax.numpy_rank_promotion("allow"), jax.legacy_prng_key("allow"):  # for brax
-        train.run_to_end(config, directory, time.perf_counter(), driver.AS_USUAL)
+        training.run_to_end(config, directory, time.perf_counter(), driver.AS_USUAL)
     (row,) = files.read_metrics(directory)
     assert row["env_steps"] == 400 and row["num_invalid"] == 0
     assert maxent_jax.load_run(directory).histogram.sum() <= 400

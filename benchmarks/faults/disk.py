@@ -13,6 +13,7 @@ from typing import Any
 from unittest import mock
 
 from benchmarks.faults import smoke
+from maxent_jax import training
 from maxent_jax.commands import train
 from maxent_jax.errors import SaveError
 from maxent_jax.runs import checkpoint, driver, files, integrity
@@ -101,7 +102,7 @@ def _train(directory: Path) -> None:
     arguments = train.read_arguments([*smoke.SMOKE, "--out", str(directory), "--resume"])
     options = driver.Options(save_minutes=arguments.save_minutes)
     with arguments.claim.hold(), contextlib.redirect_stdout(sys.stderr):
-        train.run_to_end(arguments.config, directory, time.perf_counter(), options)
+        training.run_to_end(arguments.config, directory, time.perf_counter(), options)
 
 
 if __name__ == "__main__":

@@ -93,7 +93,7 @@ MISTAKES = (
     Mistake("experiments.evaluate", "{pendulum} --gymnasium", "not played in Gymnasium"),
     Mistake("experiments.render", "{missing}", "not the directory of a run"),
     Mistake("experiments.render", "{pendulum}", "cannot be drawn"),
-    Mistake("experiments.render", "{run} --size 3", "--size must be"),
+    Mistake("experiments.render", "{run} --size 3", "--size is 3, but must be"),
     Mistake("experiments.render", "{run} --policy 9", "the run has policies 0 to 2"),
     Mistake("experiments.render", "{run}", "pip install imageio-ffmpeg", without="imageio_ffmpeg"),
     Mistake(

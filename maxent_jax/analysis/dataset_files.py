@@ -4,8 +4,8 @@
     exorl    buffer/*.npz: an episode each, as in ExORL (github.com/denisyarats/exorl) and URLB
     minari   a dataset of Minari's, in the controls of Gymnasium's environment
 
-dataset.json says what the directory holds, and whether it is complete. Writing that was stopped
-goes on where it was.
+dataset.json says what the directory holds, and whether it is complete. A dataset that was stopped
+is continued where it ended.
 """
 
 import contextlib
@@ -29,10 +29,11 @@ from maxent_jax.config.registry import MUJOCO_ENVS
 from maxent_jax.envs.task import MujocoEnv
 from maxent_jax.errors import UsageError
 from maxent_jax.precision import in_32_bits
-from maxent_jax.runs import files, locks
+from maxent_jax.runs import atomic, files, locks
 
 MANIFEST = "dataset.json"
 VERSION = 1  # of the layout
+EPISODES = "buffer"  # the folder of exorl
 
 Rows = dict[str, np.ndarray]
 
@@ -93,10 +94,13 @@ def write(
     }
     append = WRITERS[form](run, directory)
     with locks.holding(directory, wait=False):
-        written = _on_disk(directory, files.jsonable(content))
+        written = _on_disk(directory, atomic.jsonable(content))
+        if form != "minari":  # a reader would take half an episode for one
+            atomic.clear(directory, ".npz")
+            atomic.clear(directory / EPISODES, ".npz")
         if written.transitions == num:
             return
-        files.write_json(directory / MANIFEST, _manifest(content, written))
+        atomic.write_json(directory / MANIFEST, _manifest(content, written))
         on_task = components.with_task(run.components, task)
         rounds = dataset.stream(
             on_task,
@@ -114,7 +118,7 @@ def write(
                 episodes=written.episodes + len(_ends(rows)),
                 transitions=written.transitions + len(rows["policy"]),
             )
-            files.write_json(directory / MANIFEST, _manifest(content, written))
+            atomic.write_json(directory / MANIFEST, _manifest(content, written))
             report(written.transitions)
 
 
@@ -175,7 +179,7 @@ def _to_npz(run: Run, directory: Path) -> Writer:
     del run
 
     def append(rows: Rows, written: Written) -> None:
-        with files.whole_file(directory / f"part-{written.rounds:05d}.npz") as path:
+        with atomic.whole_file(directory / f"part-{written.rounds:05d}.npz") as path:
             np.savez(path, **rows)  # type: ignore[arg-type]
 
     return append
@@ -203,7 +207,7 @@ def _to_exorl(run: Run, directory: Path) -> Writer:
             length = len(episode["policy"])
             # ExORL's reader takes number and length from the name; the time is the same for all.
             name = f"00000000T000000_{i}_{length}.npz"
-            with files.whole_file(directory / "buffer" / name) as path:
+            with atomic.whole_file(directory / EPISODES / name) as path:
                 np.savez(path, **arrays)  # type: ignore[arg-type]
 
     return append
@@ -248,7 +252,7 @@ def _to_minari(run: Run, directory: Path) -> Writer:
             )
             for episode in _episodes(rows)
         ]
-        with _root(directory), files.writing(directory), warnings.catch_warnings():
+        with _root(directory), atomic.writing(directory), warnings.catch_warnings():
             # It asks for author and link, which only whoever publishes the dataset can name.
             warnings.filterwarnings("ignore", ".*is set to None|.*is out of date")
             if written.episodes == 0:

@@ -1,21 +1,21 @@
-"""Loads a finished or running run for analysis."""
+"""A run for analysis: its metrics, its policies, and what they visit in fresh episodes."""
 
 import dataclasses
 import functools
-import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.export import Exported
 
-from maxent_jax import components, errors, mixture
+from maxent_jax import components, mixture
 from maxent_jax.algorithm import methods
 from maxent_jax.analysis import dataset, export, weighing
-from maxent_jax.checks import check_path, check_seed, check_whole
+from maxent_jax.analysis.episodes import Paths, paths
+from maxent_jax.checks import check_seed, check_whole
 from maxent_jax.components import Components
 from maxent_jax.config import Config, tasks
 from maxent_jax.config.registry import CORRECTIVE
@@ -24,20 +24,12 @@ from maxent_jax.mixture import Archive, occupancy
 from maxent_jax.mixture.occupancy import Occupancy
 from maxent_jax.mixture.scores import Scores, score
 from maxent_jax.precision import in_32_bits
-from maxent_jax.runs import checkpoint, files, integrity, memory
+from maxent_jax.runs import memory
 from maxent_jax.sac import agent
 from maxent_jax.sac.agent import Policy
 
 if TYPE_CHECKING:
     from pandas import DataFrame
-
-
-class Paths(NamedTuple):
-    """Episodes of single policies."""
-
-    states: np.ndarray  # [E, T, D]
-    alive: np.ndarray  # [E, T] bool: reached before the episode's end
-    policy: np.ndarray  # [E] int, ascending; -1 if policies were drawn at each step
 
 
 class Summary(NamedTuple):
@@ -344,59 +336,6 @@ _of_episodes = jax.jit(occupancy.of_episodes, static_argnums=0)
 _score = jax.jit(score, static_argnums=0)
 
 
-def paths(visited: Occupancy) -> Paths:
-    """Returns the episodes of an occupancy."""
-    num_episodes = visited.episode_policy.shape[0]
-    states = np.asarray(visited.states).reshape(-1, num_episodes, visited.states.shape[-1])
-    alive = np.asarray(visited.alive).reshape(-1, num_episodes)
-    return Paths(np.moveaxis(states, 0, 1), alive.T, np.asarray(visited.episode_policy))
-
-
-@in_32_bits
-def load_run(path: str | Path, seed_index: int = 0, fallback: bool = False) -> Run:
-    """Loads a run's results from its last checkpoint; the replay stays on disk.
-
-    Args:
-      path: the run's directory.
-      seed_index: the seed, counted from 0, in a run of several seeds.
-      fallback: skip damaged checkpoints, with a warning for each.
-    Returns:
-      The run.
-    Raises:
-      RunError: `path` is not the directory of a run, or there is no such seed.
-      CheckpointError: there is no complete checkpoint.
-      CheckpointCorruptError: a file of the checkpoint differs from what was written.
-      TypeError: the path or the index has the wrong type.
-    """
-    directory = check_path("path", path)
-    seed_index = check_whole("seed_index", seed_index)
-    config = files.read_config(directory)
-    if not 0 <= seed_index < config.num_seeds:
-        raise errors.RunError(
-            f"seed_index is {seed_index}, but {directory} has {config.num_seeds} "
-            f"{'seed' if config.num_seeds == 1 else 'seeds'}, counted from 0."
-        )
-    remedy = "load_run(..., fallback=True), or --fallback of a command, uses the one before"
-    name, passed_over = integrity.find(directory, whole=False, fallback=fallback, remedy=remedy)
-    for sentence in passed_over.values():
-        warnings.warn(sentence, stacklevel=2)
-    results = checkpoint.restore_results(directory, name, config)
-    rows = checkpoint.read_progress(directory, name)[0].rows
-    if config.num_seeds > 1:
-        results = jax.tree.map(lambda x: x[seed_index], results)
-        rows = [files.of_seed(row, seed_index) for row in rows]
-    return Run(
-        path=directory,
-        config=config,
-        metrics={name: _column(rows, name) for name in rows[0]} if rows else {},
-        seed=config.seed + seed_index,
-        mixture=results.archive,
-        histogram=np.asarray(results.visits.cells),
-        random_histogram=np.asarray(results.random_visits.cells),
-        checkpoint=name,
-    )
-
-
 def mean_ends(run: Run, episodes: Paths) -> np.ndarray:
     """Returns the mean end of each policy's episodes, [P, 2] on the grid's axes."""
     ends = _located_ends(run, episodes)
@@ -428,8 +367,3 @@ def _scalar_columns(metrics: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         for index in np.ndindex(values.shape[1:]):
             columns["_".join([name, *map(str, index)])] = values[:, *index]
     return columns
-
-
-def _column(rows: list[dict[str, Any]], name: str) -> np.ndarray:
-    values = np.array([row.get(name) for row in rows])
-    return values.astype(float) if values.dtype == object else values

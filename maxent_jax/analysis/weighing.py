@@ -32,9 +32,9 @@ def without_weightless(visited: Occupancy, weights: np.ndarray) -> Occupancy:
         return visited
     rows = np.tile(counts, len(visited.alive) // len(policy))
     of_states = ("states", "features", "policy", "weight", "alive")
-    paid = visited.task_return
+    returns = visited.task_return
     return visited._replace(
         **{name: getattr(visited, name)[rows] for name in of_states},
         episode_policy=visited.episode_policy[counts],
-        task_return=None if paid is None else paid[counts],
+        task_return=None if returns is None else returns[counts],
     )

@@ -43,7 +43,7 @@ class Settings:
     """Standard deviation of the noise on the target's action."""
     noise_clip: float = 0.5
     actor_period: int = 2
-    """Updates of the critics in an update of the actor and of the targets."""
+    """Updates of the critics for each update of the actor and of the targets."""
     return_scale: float = 2.5
     """α: the weight of the return against imitation."""
 

@@ -115,6 +115,12 @@ def flag_value(argv: Sequence[str], flag: str) -> str | None:
     return values[-1] if values else None
 
 
+def check_least(flag: str, value: int, least: int = 1) -> None:
+    """Raises UsageError if the value of a flag is below the least."""
+    if value < least:
+        raise UsageError(f"{flag} is {value}, but must be at least {least}.")
+
+
 def import_modules(argv: Sequence[str], draws: bool = False) -> None:
     """Imports the modules named by --import, which register environments, bonuses or methods.
 

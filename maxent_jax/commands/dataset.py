@@ -12,7 +12,6 @@ from typing import Annotated
 
 import tyro
 
-from maxent_jax import errors
 from maxent_jax.checks import check_choice, check_seed
 from maxent_jax.commands import cli
 from maxent_jax.config import tasks
@@ -31,7 +30,7 @@ class Arguments:
     format: str = "npz"
     """npz (numpy, the keys of D4RL), minari (extra minari), or exorl (an npz for each episode)."""
     transitions: int = 100_000
-    """How many."""
+    """Transitions to write."""
     task: str = tasks.NONE
     """Task whose rewards are added (docs/how-to/finetune.md); none: no rewards."""
     seed: int = 0
@@ -55,8 +54,7 @@ def main(argv: Sequence[str]) -> None:
     cli.import_modules(argv)
     arguments = cli.parse(Arguments, argv, "dataset")
     check_choice("format", arguments.format, FORMATS)
-    if arguments.transitions < 1:
-        raise errors.UsageError("--transitions must be at least 1.")
+    cli.check_least("--transitions", arguments.transitions)
     check_seed("--seed", arguments.seed)
     config = files.read_config(arguments.directory)
     config.check_registered()
@@ -64,9 +62,7 @@ def main(argv: Sequence[str]) -> None:
         tasks.parse(arguments.task, config.env)
         tasks.check_registered(arguments.task)
     integrity.check_any(arguments.directory)
-    out = arguments.out or arguments.directory.with_name(
-        f"{arguments.directory.name}-{arguments.format}"
-    )
+    out = arguments.out or files.beside(arguments.directory, arguments.format)
     headless.draw_nothing()
     runtime.start(config.simulates_in_jax)
     from maxent_jax.analysis import dataset_files, load_run

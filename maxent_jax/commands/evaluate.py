@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from maxent_jax import errors
 from maxent_jax.checks import check_seed
 from maxent_jax.commands import cli
-from maxent_jax.runs import files, integrity, runtime
+from maxent_jax.runs import atomic, files, integrity, runtime
 from maxent_jax.visual import headless
 
 if TYPE_CHECKING:
@@ -50,8 +49,7 @@ def main(argv: Sequence[str]) -> None:
     """
     cli.import_modules(argv)
     arguments = cli.parse(Arguments, argv, "evaluate")
-    if arguments.episodes < 1:
-        raise errors.UsageError("--episodes must be at least 1.")
+    cli.check_least("--episodes", arguments.episodes)
     check_seed("--seed", arguments.seed)
     config = files.read_config(arguments.directory)
     config.check_registered()
@@ -64,7 +62,7 @@ def main(argv: Sequence[str]) -> None:
 
         gymnasium_play.make(config).close()  # fails here rather than after the rollouts
     report = evaluate(arguments)
-    files.write_json(files.evaluation(arguments.directory, arguments.seed_index), report)
+    atomic.write_json(files.evaluation(arguments.directory, arguments.seed_index), report)
     _print(report)
 
 

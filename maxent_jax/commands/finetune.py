@@ -34,7 +34,7 @@ class Arguments(train.Arguments):
         """The new run's directory: --out, or one named after the run, the task and the start."""
         own = self.config.downstream
         task = files.as_name(own.task)
-        return self.out or Path(f"{self.run}-{task}-{own.start_from}-{self.config.seed}")
+        return self.out or files.beside(self.run, f"{task}-{own.start_from}-{self.config.seed}")
 
 
 def read_arguments(argv: Sequence[str]) -> Arguments:

@@ -16,7 +16,7 @@ import tyro
 from maxent_jax import errors
 from maxent_jax.checks import check_seed
 from maxent_jax.commands import cli
-from maxent_jax.runs import files, integrity, progress, runtime
+from maxent_jax.runs import atomic, files, integrity, progress, runtime
 from maxent_jax.visual import headless, video
 
 if TYPE_CHECKING:
@@ -85,22 +85,23 @@ def _check(arguments: Arguments, num_policies: int) -> None:
             policy is not None and not 0 <= policy < num_policies,
             f"--policy is {policy}, but the run has policies 0 to {num_policies - 1}.",
         ),
-        (arguments.episodes < 1, "--episodes must be at least 1."),
         (
             arguments.speed is not None and not 0.01 <= arguments.speed <= 1000,
-            "--speed must be from 0.01 to 1,000.",
+            f"--speed is {arguments.speed}, but must be from 0.01 to 1,000.",
         ),
         (
             not smallest <= arguments.size <= largest or arguments.size % 4,
-            f"--size must be a multiple of 4 from {smallest} to {largest:,}.",
+            f"--size is {arguments.size}, but must be a multiple of 4 from {smallest} to "
+            f"{largest:,}.",
         ),
         (
             not 1 <= arguments.stills <= MOST_STILLS,
-            f"--stills must be from 1 to {MOST_STILLS}.",
+            f"--stills is {arguments.stills}, but must be from 1 to {MOST_STILLS}.",
         ),
     ):
         if wrong:
             raise errors.UsageError(sentence)
+    cli.check_least("--episodes", arguments.episodes)
     check_seed("--seed", arguments.seed)
 
 
@@ -156,7 +157,7 @@ class _Studio:
             frames.mosaic([frames.picture(shot, episode, step) for episode in episodes], columns)
             for step in progress.track(steps, name)
         )
-        with files.whole_file(self._folder / f"{name}.mp4") as temporary:
+        with atomic.whole_file(self._folder / f"{name}.mp4") as temporary:
             video.write(temporary, pictures, self._frame_rate)
         self.num_videos += 1
         self.longest = max(self.longest, len(steps) / self._frame_rate)
@@ -164,5 +165,5 @@ class _Studio:
         tiles = [
             frames.picture(self._still, episode, step) for episode in episodes for step in shown
         ]
-        with files.whole_file(self._folder / f"{name}.png") as temporary:
+        with atomic.whole_file(self._folder / f"{name}.png") as temporary:
             Image.fromarray(frames.mosaic(tiles, columns=len(shown))).save(temporary)

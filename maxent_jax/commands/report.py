@@ -17,7 +17,7 @@ import tyro
 from maxent_jax import errors
 from maxent_jax.checks import check_seed
 from maxent_jax.commands import cli, render
-from maxent_jax.runs import files, integrity, progress, runtime
+from maxent_jax.runs import atomic, files, integrity, progress, runtime
 from maxent_jax.visual import headless
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def main(argv: Sequence[str]) -> None:
     headless.draw_nothing()
     runtime.start(any(config.simulates_in_jax for config in configs))
     page = make(arguments)
-    with files.whole_file(path) as temporary:
+    with atomic.whole_file(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     print(f"{path}: {len(page.encode()) / 1e6:.1f} MB.")
 
@@ -74,8 +74,7 @@ def _check(arguments: Arguments) -> Path:
         raise errors.UsageError("no run is given: name the directory of one run, or of several.")
     if len(set(directories)) < len(directories):
         raise errors.UsageError("a directory is named twice: name each run once.")
-    if arguments.episodes < 1:
-        raise errors.UsageError("--episodes must be at least 1.")
+    cli.check_least("--episodes", arguments.episodes)
     check_seed("--seed", arguments.seed)
     here = directories[0] if len(directories) == 1 else Path()
     path = arguments.out or here / "report.html"

@@ -20,13 +20,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from maxent_jax import errors
+from maxent_jax import errors, training
 from maxent_jax.checks import check_choice
-from maxent_jax.commands import cli, launcher, train
+from maxent_jax.commands import cli, launcher
 from maxent_jax.runs import files, locks, runtime
 from maxent_jax.runs.claim import Claim
 from maxent_jax.runs.signals import Interrupted, heeded
-from maxent_jax.studies import protocol
+from maxent_jax.studies import disk, protocol
 from maxent_jax.studies.protocol import Cell
 from maxent_jax.visual import headless
 
@@ -89,7 +89,7 @@ def main(argv: Sequence[str]) -> None:
 
         hazan_weights.held(arguments.out / "fig3", arguments.scale, arguments.seeds)
     for name, cells in studies.items():
-        protocol.claim(arguments.out / name, name, arguments.scale, cells)
+        disk.claim(arguments.out / name, name, arguments.scale, cells)
     for what in whats:
         with locks.holding(arguments.out / what):  # fails here rather than after hours of work
             pass
@@ -157,7 +157,7 @@ def _unfinished(out: Path, studies: Mapping[str, Sequence[Cell]]) -> list[str]:
         f"{name}/{cell.name}"
         for name, cells in studies.items()
         for cell in cells
-        if not protocol.finished(out / name, cell)
+        if not disk.finished(out / name, cell)
     ]
 
 
@@ -172,7 +172,7 @@ def _train(directory: Path, cells: Sequence[Cell]) -> int:
         now, left, busy, trained = left, [], [], False
         for cell in now:
             try:
-                if cell.source and not protocol.finished(directory, cell.source):
+                if cell.source and not disk.finished(directory, cell.source):
                     left.append(cell)
                 else:
                     trained |= _train_cell(directory, cell)
@@ -191,14 +191,14 @@ def _train(directory: Path, cells: Sequence[Cell]) -> int:
 def _train_cell(directory: Path, cell: Cell) -> bool:
     """Trains the cell's run to its end; returns whether there was anything left to do."""
     started = time.perf_counter()
-    if protocol.finished(directory, cell):
+    if disk.finished(directory, cell):
         return False
-    at, config = protocol.home(directory, cell), protocol.config_of(directory, cell)
+    at, config = disk.home(directory, cell), disk.config_of(directory, cell)
     runtime.prepare(config.simulates_in_jax)
     with Claim(at, config, resume=True).hold():
         from maxent_jax.runs import driver  # loads jax
 
-        received = train.run_to_end(config, at, started, driver.Options(fallback=True))
+        received = training.run_to_end(config, at, started, driver.Options(fallback=True))
     if received is not None:
         raise Interrupted(received, at)
     return True

@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any
 
 from maxent_jax import errors
+from maxent_jax.checks import check_seed
 from maxent_jax.commands import cli, trajectories
-from maxent_jax.runs import files, progress, runtime
+from maxent_jax.runs import atomic, files, progress, runtime
 from maxent_jax.visual import headless
 
 FITTED = ("river swim", "Garnet", "double chain", "four rooms", "open grid")
 PLAIN = ("river swim", "Garnet", "double chain", "small rooms")  # where an iteration is cheap
+FEWEST = 20  # iterations for the fit of the rate
 ON_GRIDS = 300  # iterations of the comparison in the other MDPs
 PLANNING_BUDGET, TOY_BUDGET = 4096, 16
 SAMPLES, TOY_SAMPLES = (1_000, 10_000, 100_000), (500, 1_000)
@@ -58,14 +60,15 @@ def main(argv: Sequence[str]) -> None:
         trajectories.main(argv[1:])
         return
     arguments = _check(cli.parse(Arguments, argv, "theory"))
+    folder = arguments.figures or arguments.out.parent
+    atomic.check_file(arguments.out)
+    atomic.check_folder(folder)
     headless.draw_nothing()
     runtime.start(simulates_in_jax=False)
-    results = files.jsonable(study(arguments))
+    results = atomic.jsonable(study(arguments))
     from maxent_jax.theory import tabular_figures
 
-    folder = arguments.figures or arguments.out.parent
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    files.write_json(arguments.out, results)
+    atomic.write_json(arguments.out, results)
     paths = tabular_figures.draw(results, folder)
     _print(results)
     print(", ".join(str(path) for path in (arguments.out, *paths)))
@@ -131,16 +134,24 @@ def _check(arguments: Arguments) -> Arguments:
             not 0 < arguments.tolerance < float("inf"),
             f"--tolerance is {arguments.tolerance}, but must be a positive number.",
         ),
-        (arguments.iterations < 20, "--iterations must be at least 20, to fit a rate."),
         (
-            not 1 <= arguments.few_seeds <= arguments.seeds or arguments.seeds < 2,
-            "--seeds must be at least 2, and --few-seeds from 1 to --seeds.",
+            arguments.iterations < FEWEST,
+            f"--iterations is {arguments.iterations}, but must be at least {FEWEST}, to fit a "
+            f"rate.",
         ),
-        (not 0 <= arguments.seed < 2**31, "--seed must be 0 or more, and below 2^31."),
-        (arguments.out.is_dir(), f"--out {arguments.out} is a folder: name a file."),
+        (
+            arguments.seeds < 2,
+            f"--seeds is {arguments.seeds}, but must be at least 2, for an interval.",
+        ),
+        (
+            not 1 <= arguments.few_seeds <= arguments.seeds,
+            f"--few-seeds is {arguments.few_seeds}, but must be from 1 to --seeds = "
+            f"{arguments.seeds}.",
+        ),
     ):
         if wrong:
             raise errors.UsageError(sentence)
+    check_seed("--seed", arguments.seed)
     return arguments
 
 

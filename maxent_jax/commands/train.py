@@ -11,20 +11,14 @@ import shlex
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from maxent_jax import errors
-from maxent_jax.checks import check_path
+from maxent_jax import errors, training
 from maxent_jax.commands import cli
 from maxent_jax.config import Config, imports, preset, tasks
 from maxent_jax.runs import files, integrity, runtime, source
 from maxent_jax.runs.claim import Claim
 from maxent_jax.runs.loggers import Sinks
 from maxent_jax.visual import headless
-
-if TYPE_CHECKING:
-    from maxent_jax.analysis import Run
-    from maxent_jax.runs.driver import Options
 
 # What matters first: --help shows these, and --help-all the rest.
 SHOWN = (
@@ -225,58 +219,10 @@ def run(arguments: Arguments, started: float) -> None:
     driver.check(config, options)  # before there is a directory
     with holding:
         hosts.wait_for_all("claimed")
-        run_to_end(config, arguments.directory, started, options)
+        training.run_to_end(config, arguments.directory, started, options)
     if hosts.is_first():
         _print_figures(arguments.directory)
         _point_onward(arguments.directory)
-
-
-def train(config: Config, out: str | Path, resume: bool = False, overwrite: bool = False) -> "Run":
-    """Trains a run in this process, draws its figures and loads it, as the command `train` does.
-
-    Progress goes to standard error, and a summary to standard output.
-
-    Args:
-      config: the settings, for example `preset("quick", env="pendulum")`.
-      out: the run's directory.
-      resume: continue the run in the directory from its last checkpoint; start without one.
-      overwrite: remove the run that the directory holds, and start again.
-    Returns:
-      The finished run; of several seeds, the first (see `load_run`).
-    Raises:
-      UsageError, RunError: the directory is not free, or holds a run with other settings.
-      ConfigError: the settings do not fit this machine, or the run to start from.
-      CheckpointCorruptError: the last checkpoint is damaged.
-      SaveError: a file cannot be written.
-      NonFiniteError: training produced a number that is not finite.
-      Interrupted: a signal arrived, and the run is saved.
-    """
-    from maxent_jax.analysis import load_run
-    from maxent_jax.runs import driver
-
-    started, directory = time.perf_counter(), check_path("out", out)
-    if not (resume and integrity.checkpoints(directory)):
-        config.check_new()
-    claim = Claim(directory, config, resume, overwrite)
-    claim.check()
-    runtime.prepare(config.simulates_in_jax)
-    driver.check(config)
-    with claim.hold():
-        run_to_end(config, directory, started, driver.AS_USUAL)
-    return load_run(directory)
-
-
-def run_to_end(config: Config, directory: Path, started: float, options: "Options") -> int | None:
-    """Trains the rest of the run and draws its figures; returns `driver.Ended.received`."""
-    from maxent_jax.runs import driver, hosts  # loads jax
-    from maxent_jax.visual import figures, plotting
-
-    ended = driver.train(config, directory, started, options)
-    if hosts.is_first():
-        if ended.trained:  # `evaluate` may have drawn what the run was before
-            plotting.remove_saved(directory)
-        figures.draw_missing(directory)
-    return ended.received
 
 
 def _print_figures(directory: Path) -> None:

@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from maxent_jax import errors
+from maxent_jax.checks import check_seed
 from maxent_jax.commands import cli
-from maxent_jax.runs import files, progress, runtime
+from maxent_jax.runs import atomic, files, progress, runtime
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,10 +36,10 @@ class Arguments:
 def main(argv: Sequence[str]) -> None:
     """Parses and checks the arguments, and only then computes."""
     arguments = _check(cli.parse(Arguments, argv, "theory trajectories"))
+    atomic.check_file(arguments.out)
     runtime.start(simulates_in_jax=False)
-    results = files.jsonable(study(arguments))
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    files.write_json(arguments.out, results)
+    results = atomic.jsonable(study(arguments))
+    atomic.write_json(arguments.out, results)
     _print(results)
     print(arguments.out)
 
@@ -70,12 +70,8 @@ def _check(arguments: Arguments) -> Arguments:
     if arguments.toy:
         arguments = dataclasses.replace(arguments, iterations=10, episodes=200, seeds=2)
     for name in ("iterations", "episodes", "seeds"):
-        if getattr(arguments, name) < 1:
-            raise errors.UsageError(f"--{name} must be at least 1.")
-    if not 0 <= arguments.seed < 2**31:
-        raise errors.UsageError("--seed must be 0 or more, and below 2^31.")
-    if arguments.out.is_dir():
-        raise errors.UsageError(f"--out {arguments.out} is a folder: name a file.")
+        cli.check_least(f"--{name}", getattr(arguments, name))
+    check_seed("--seed", arguments.seed)
     return arguments
 
 

@@ -37,12 +37,18 @@ def verify(directory: Path, names: Sequence[str]) -> bool:
     intact = True
     for name in names:
         damages = list(integrity.damages(directory, name))
+        folder = directory / integrity.FOLDER / name
+        try:
+            sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
+        except FileNotFoundError:
+            sizes = []
+        if not folder.exists():
+            print(f"checkpoint {name}: removed meanwhile, because its run has continued")
+            continue
         intact &= not damages
-        files = [p for p in (directory / integrity.FOLDER / name).rglob("*") if p.is_file()]
-        size = sum(path.stat().st_size for path in files) / 1e6
         print(
             f"checkpoint {name}: {'damaged' if damages else 'intact'}, "
-            f"{len(files)} files, {size:,.1f} MB"
+            f"{len(sizes)} files, {sum(sizes) / 1e6:,.1f} MB"
         )
         for damage in damages:
             print(f"  {damage}")

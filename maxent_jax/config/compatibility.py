@@ -1,6 +1,5 @@
 """Says which settings do not go together. Loads no array library."""
 
-import itertools
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -18,8 +17,12 @@ def problems(settings: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
       settings: every setting by name, each valid by itself.
       row: of the environment.
     """
-    groups = (_budget, _downstream, _mixture, _bonus, _robot, _learner)
-    return itertools.chain.from_iterable(group(settings, row) for group in groups)
+    yield from _budget(settings)
+    yield from _downstream(settings)
+    yield from _mixture(settings)
+    yield from _bonus(settings)
+    yield from _robot(settings, row)
+    yield from _learner(settings)
 
 
 def problems_of_new_runs(c: SimpleNamespace) -> Iterator[str]:
@@ -71,8 +74,7 @@ def problems_of_new_runs(c: SimpleNamespace) -> Iterator[str]:
         )
 
 
-def _budget(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
-    del row
+def _budget(c: SimpleNamespace) -> Iterator[str]:
     segment = c.num_envs * c.num_segments
     if c.steps_per_iteration % segment:
         yield (
@@ -115,8 +117,7 @@ def _budget(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
         )
 
 
-def _mixture(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
-    del row
+def _mixture(c: SimpleNamespace) -> Iterator[str]:
     if c.mixing == "step" and (c.pooled or c.leave_own_out or c.weights == CORRECTIVE):
         yield (
             "mixing is step, so no state belongs to one policy: pooled, leave-own-out and fully "
@@ -148,8 +149,7 @@ def _mixture(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
         )
 
 
-def _bonus(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
-    del row
+def _bonus(c: SimpleNamespace) -> Iterator[str]:
     if registry.bonus_of(c.method) not in (None, c.bonus):
         yield f"method is {c.method}, but bonus is {c.bonus}: leave bonus out, the method sets it."
     if c.bonus == "none":
@@ -197,8 +197,7 @@ def _robot(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
         )
 
 
-def _learner(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
-    del row
+def _learner(c: SimpleNamespace) -> Iterator[str]:
     if c.policy_lag > 1:
         yield f"policy-lag is {c.policy_lag}, but must be 0 or 1."
     if c.batch_size > c.replay_size:
@@ -211,8 +210,7 @@ def _learner(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
         yield f"replay-dtype is {c.replay_dtype}, but must be float32 with yaw-copies above 0."
 
 
-def _downstream(c: SimpleNamespace, row: EnvironmentRow) -> Iterator[str]:
-    del row
+def _downstream(c: SimpleNamespace) -> Iterator[str]:
     if c.intrinsic_decay and c.intrinsic_weight == 0:
         yield f"intrinsic-decay is {c.intrinsic_decay}, but intrinsic-weight is 0: leave one out."
     if c.task == tasks.NONE:

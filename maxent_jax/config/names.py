@@ -11,7 +11,8 @@ MIXINGS = ("episode", "step")
 WEIGHTS = ("method", *registry.WEIGHTS)
 REFERENCES = ("method", *registry.REFERENCES)
 STARTS = ("method", *registry.STARTS)
-# What a run can start from, of another run. In the first group, its policies play first episodes.
+# What a run can take from the run that it starts from. With these, the policies of that run play
+# the first episodes.
 PLAYING = ("best", "mixture", "both")
 FILLING = ("mixture", "both")  # with these the episodes fill the replay
 WITH_ITS_AGENT = ("last", "best", "both")

@@ -107,7 +107,7 @@ _BUDGETS = {
     "humanoid": dict(num_iterations=4, updates_per_step=0.25, random_baseline=False, **_LONG),
 }
 
-# What a protocol changes in every preset. The length of METRA's episodes leaves fewer states.
+# What a protocol changes in every preset. METRA's episodes are shorter, so there are fewer states.
 PROTOCOLS: dict[str, dict[str, Any]] = {
     "own": {},
     "metra": dict(
@@ -157,9 +157,9 @@ IN_ENV: dict[tuple[str, str], dict[str, Any]] = {
 }
 
 # What a method changes in some environments, by preset. If V on Walker2d starts from the best
-# policy, it only walks in that policy's direction (docs/results/learning.md). METRA's budget
-# is its authors', and so are its networks but in `quick`, where a CPU has no time for their size.
-# In `paper` both are those of the other baselines.
+# policy, it only walks in that policy's direction (docs/results/learning.md). METRA has its
+# authors' budget and, except in `quick`, their networks, which are too large for a CPU. In `paper`
+# it has the budget and the networks of the other baselines.
 OF_METHOD_IN_ENV: dict[tuple[str, str, str], dict[str, Any]] = {
     **{(preset, "walker2d", "v"): dict(start="scratch") for preset in ("quick", "gpu")},
     **{

@@ -150,7 +150,7 @@ def _metra() -> MethodRow:
     return row._replace(settings={**row.settings, **own})
 
 
-TASK = "task"  # the method that is paid by a task alone
+TASK = "task"  # the method whose only reward is a task's
 
 METHODS = {
     "h": MethodRow("geometric", 0, "mixture", "scratch"),
@@ -278,10 +278,10 @@ def register_method(
     check_choice("weights", weights, WEIGHTS)
     check_choice("reference", reference, REFERENCES)
     check_choice("start", start, STARTS)
-    if not isinstance(refresh_period, int) or refresh_period < 0:
-        raise ConfigTypeError(
-            f"refresh_period is {refresh_period!r}, but must be a whole number of at least 0."
-        )
+    if isinstance(refresh_period, bool) or not isinstance(refresh_period, int):
+        raise ConfigTypeError(f"refresh_period is {refresh_period!r}, but must be a whole number.")
+    if refresh_period < 0:
+        raise ConfigError(f"refresh_period is {refresh_period}, but must be 0 or more.")
     if weights == CORRECTIVE:  # computed by the program; the others are a table
         settings, weights = {"weights": CORRECTIVE, **settings}, "uniform"
     METHODS[f"{USER}{name}"] = MethodRow(weights, refresh_period, reference, start, settings)

@@ -46,7 +46,7 @@ class Budget(_Checked):
     num_segments: int = 15
     """Segments of an iteration; progress is shown after each."""
     plateau_segments: int = 0
-    """End an iteration early when its mean reward over so many segments stops rising; 0: never."""
+    """End an iteration when its mean reward over this many segments stops rising; 0: never."""
     plateau_tolerance: float = 0.05
     """A rise up to this share of the iteration's whole rise in reward counts as a plateau."""
 
@@ -94,11 +94,11 @@ class Intrinsic(_Checked):
     shaping_space: str = "features"
     """Distance of the potential: in features (R), or in position (first two, no joint noise)."""
     shaping_survives_death: bool = False
-    """Keep the potential at health termination; shaping is then not policy-invariant."""
+    """Keep the potential at health termination; shaping may then change the optimal policy."""
     alive_bonus: float = 0.0
     """Reward added to each step without health termination; --reward-scale does not apply."""
     stale_rewards: bool = False
-    """Keep each step's reward as it was when taken, although the reference changes."""
+    """Keep the reward that each step had when it was taken, although the reference changes."""
     episodic_weight: float = 0.0
     """λ: weight of the episodic term; 0: none."""
     bonus: str = "none"
@@ -197,13 +197,13 @@ class Downstream(_Checked):
     intrinsic_weight: float = 1.0
     """β: factor on the intrinsic reward."""
     intrinsic_decay: int = 0
-    """Env steps after which β has fallen to 0, linearly; 0: it does not fall."""
+    """Env steps over which β falls linearly to 0; 0: β is constant."""
     source: str = ""
     """Directory of the run to start from."""
     source_seed: int = 0
     """Which seed of that run, from 0, if it has several."""
     source_iterations: int = 0
-    """Use only the policies of that run's first iterations, this many; 0: all."""
+    """Use the policies of this many iterations of that run, the first ones; 0: of all."""
     restart_share: float = 0.0
     """Share of the episodes that begin at a state of the best tenth of the first episodes."""
     critic_steps: int = 0
@@ -236,7 +236,7 @@ class Config(_Checked):
     (see --import)."""
     method: str = "v"
     """h (Hazan 2019), la (Liu & Abbeel 2021), v (Veritas), h-official, a bonus as a baseline, or
-    task (one policy, paid by --task alone)."""
+    task (one policy, rewarded by --task alone)."""
     preset: str = "quick"
     """Defaults of the other flags: smoke, quick, gpu or paper (docs/concepts/presets.md)."""
     protocol: str = "own"
@@ -277,7 +277,7 @@ class Config(_Checked):
 
     @property
     def explores(self) -> bool:
-        """Whether an intrinsic reward is paid, and not a task's alone."""
+        """Whether the agent gets an intrinsic reward, not that of a task alone."""
         return self.downstream.intrinsic_weight > 0
 
     @property

@@ -28,7 +28,7 @@ class Family(NamedTuple):
 
 _ON_A_PLANE = ("ant", "humanoid")
 
-# docs/how-to/finetune.md says what each pays.
+# docs/how-to/finetune.md describes each reward.
 FAMILIES = {
     "gymnasium": Family(ENVS),
     "forward": Family(MUJOCO_ENVS),

@@ -2,14 +2,13 @@
 
 A checkpoint is a folder named by the progress of the run. It is written under another name and
 renamed once it is complete and sealed, so a folder with its final name that is incomplete is
-damaged. Archive and visits are a separate item, so analysis neither loads nor reads the replay.
+damaged. See stored.py for the arrays in it.
 """
 
 import contextlib
 import functools
 import json
 import logging
-import math
 import os
 import re
 import shutil
@@ -18,21 +17,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
 from maxent_jax import algorithm
 from maxent_jax.algorithm import State
-from maxent_jax.algorithm.experience import Step
-from maxent_jax.algorithm.learner import Learner, Visits
 from maxent_jax.config import Config
-from maxent_jax.envs.base import Episodes, Restarts
 from maxent_jax.errors import CheckpointError, SaveError
-from maxent_jax.mixture import Archive
-from maxent_jax.runs import files, integrity
+from maxent_jax.runs import atomic, files, integrity, stored
 from maxent_jax.runs.integrity import ARRAYS, FOLDER, UNFINISHED
-from maxent_jax.runs.progress import say
+from maxent_jax.runs.stored import Results
 from maxent_jax.sac.agent import Parameters
 
 CHECKPOINTS_KEPT = 2
@@ -55,12 +49,13 @@ class Progress(NamedTuple):
         return f"{len(self.rows)}" + ("" if self.begun is None else f"+{len(self.segments)}")
 
 
-class Results(NamedTuple):
-    """What analysis needs of a state. With several seeds, leaves have a leading axis [S, ...]."""
+class Latest(NamedTuple):
+    """What analysis needs of a run's latest checkpoint."""
 
-    archive: Archive
-    visits: Visits
-    random_visits: Visits
+    name: str
+    results: Results
+    rows: list[dict[str, Any]]  # as in metrics.jsonl
+    passed_over: dict[str, str]  # by name, a sentence on each damaged checkpoint
 
 
 def save(run_directory: Path, state: State, progress: Progress, machine: dict[str, Any]) -> None:
@@ -81,16 +76,17 @@ def save(run_directory: Path, state: State, progress: Progress, machine: dict[st
             shutil.rmtree(temporary, ignore_errors=True)
             temporary.mkdir(parents=True)
         with _silence():
-            ocp.save_checkpointables(temporary / ARRAYS, _items(_stored(state)))
+            ocp.save_checkpointables(temporary / ARRAYS, stored.items(stored.encode(state)))
         if first:
             shutil.copy(run_directory / files.CONFIG, temporary)
             files.write_metrics(temporary, progress.rows)
             _write_progress(temporary, progress, machine)
             integrity.seal(temporary)
-            shutil.rmtree(folder / progress.name, ignore_errors=True)
+            if (folder / progress.name).exists():
+                integrity.remove(run_directory, progress.name)
             temporary.rename(folder / progress.name)
             for old in integrity.checkpoints(run_directory)[:-CHECKPOINTS_KEPT]:
-                shutil.rmtree(folder / old)
+                integrity.remove(run_directory, old)
     except (OSError, ValueError, SaveError) as error:  # TensorStore raises ValueErrors
         shutil.rmtree(temporary, ignore_errors=True)
         raise SaveError(
@@ -122,13 +118,36 @@ def restore(run_directory: Path, name: str, config: Config, placed: State | None
       CheckpointError: the checkpoint does not hold a state of this config.
     """
     shapes = _shapes(config)
-    wanted = _items(_abstract(shapes, placed))
+    wanted = stored.items(stored.abstract(shapes, placed))
     held = _held(run_directory, name)
-    wanted["rest"] = _less(wanted["rest"], held)
+    wanted["rest"] = stored.held_part(wanted["rest"], held)
     items = _load(run_directory, name, wanted)
-    results, rest = items["results"], _more(items["rest"], shapes, placed)
+    results, rest = items["results"], stored.completed(items["rest"], shapes, placed)
     learner = rest.learner._replace(visits=results.visits, random_visits=results.random_visits)
-    return _as_computed(rest._replace(archive=results.archive, learner=learner), shapes, placed)
+    return stored.decode(rest._replace(archive=results.archive, learner=learner), shapes, placed)
+
+
+def restore_latest(
+    run_directory: Path, config: Config, remedy: str, fallback: bool = False
+) -> Latest:
+    """Restores the results of the latest checkpoint, also while the run trains and removes it.
+
+    Args:
+      remedy: as in `integrity.find`.
+      fallback: as in `integrity.find`.
+    Raises:
+      CheckpointError: the run has no checkpoint, or it does not hold results of this config.
+      CheckpointCorruptError: as in `integrity.find`.
+    """
+    name, passed_over = integrity.find(run_directory, False, fallback, remedy)
+    try:
+        results = restore_results(run_directory, name, config)
+        rows = read_progress(run_directory, name)[0].rows
+    except Exception:
+        if (run_directory / FOLDER / name).exists():
+            raise
+        return restore_latest(run_directory, config, remedy, fallback)
+    return Latest(name, results, rows, passed_over)
 
 
 def restore_results(run_directory: Path, name: str, config: Config) -> Results:
@@ -137,7 +156,7 @@ def restore_results(run_directory: Path, name: str, config: Config) -> Results:
     Raises:
       CheckpointError: the checkpoint does not hold results of this config.
     """
-    results: Results = _items(_abstract(_shapes(config)))["results"]
+    results: Results = stored.items(stored.abstract(_shapes(config)))["results"]
     if files.read_schema(run_directory) >= WITH_MOMENTS:
         return _load(run_directory, name, {"results": results})["results"]
     less: Any = results.archive.parameters._asdict()
@@ -154,72 +173,6 @@ def _held(run_directory: Path, name: str) -> Mapping[str, Any]:
     return ocp.checkpointables_metadata(path).metadata["rest"]["learner"]
 
 
-def _less(rest: State, held: Mapping[str, Any]) -> State:
-    """What the checkpoint holds of the state: Orbax insists on the presence and shape of all."""
-
-    def kept(fields: Any, those: Mapping[str, Any]) -> Any:
-        return {name: x for name, x in fields._asdict().items() if name in those}
-
-    learner = rest.learner
-    episodes = learner.episodes
-    if isinstance(episodes.restarts, Restarts):
-        share: Any = episodes.restarts.share
-        shape = held["episodes"]["restarts"]["share"].shape
-        share = jax.ShapeDtypeStruct(shape, share.dtype, sharding=share.sharding)
-        episodes = episodes._replace(restarts=episodes.restarts._replace(share=share))
-    plane: Any = learner.plane
-    if plane is None and held.get("plane") is not None:  # read, and dropped by `_more`
-        where = learner.env_steps.sharding
-        plane = jax.ShapeDtypeStruct(held["plane"].shape, jnp.bool_, sharding=where)
-    learner = learner._replace(
-        plane=plane,
-        episodes=kept(episodes, held["episodes"]),
-        replay=learner.replay._replace(
-            items=kept(learner.replay.items, held["replay"]["items"]),
-        ),
-    )
-    return rest._replace(learner=kept(learner, held))
-
-
-def _more(rest: State, shapes: State, placed: State | None) -> State:
-    """The state of which `_less` gave a part.
-
-    A checkpoint without a plane begins an empty one. Where positions are not metres there is none,
-    whatever the checkpoint holds: older releases took them for metres in any environment.
-    """
-    learner: Any = rest.learner
-    replay = learner["replay"]
-    found = {
-        "episodes": _with_share_of_each(Episodes(**learner["episodes"]), shapes, placed),
-        "replay": replay._replace(items=Step(**replay.items)),
-    }
-    plane = shapes.learner.plane
-    if plane is None:
-        found["plane"] = None
-    elif learner.get("plane") is None:
-        say("note: an older release began this run: cells_1m counts from here on.")
-        device = None if placed is None else placed.learner.plane
-        found["plane"] = jnp.zeros(plane.shape, plane.dtype, device=device)
-    return rest._replace(learner=Learner(**{**learner, **found}))
-
-
-def _with_share_of_each(episodes: Episodes, shapes: State, placed: State | None) -> Episodes:
-    """Episodes with a share of restarts for each; older checkpoints hold one for all of them."""
-    restarts: Any = episodes.restarts
-    wanted: Any = shapes.learner.episodes.restarts
-    if not isinstance(restarts, Restarts) or restarts.share.shape == wanted.share.shape:
-        return episodes
-    num_envs, shape = shapes.learner.place.shape[-1], wanted.share.shape
-
-    def of_each(of_all: jax.Array) -> jax.Array:
-        of_agent = jnp.broadcast_to(jnp.arange(shape[-1]) < num_envs, shape)
-        return jnp.where(of_agent, jnp.broadcast_to(of_all[..., None], shape), 0.0)
-
-    where: Any = None if placed is None else placed.learner.episodes.restarts
-    made = jax.jit(of_each, out_shardings=where and where.share)(restarts.share)
-    return episodes._replace(restarts=restarts._replace(share=made))
-
-
 def _write_progress(folder: Path, progress: Progress, machine: dict[str, Any]) -> None:
     parts = {f"begun/{key}": value for key, value in (progress.begun or {}).items()}
     for i, segment in enumerate(progress.segments):
@@ -232,7 +185,7 @@ def _write_progress(folder: Path, progress: Progress, machine: dict[str, Any]) -
         "clock": progress.clock,
         "computed_with": files.stack() | machine,
     }
-    files.write_json(folder / PROGRESS, content)
+    atomic.write_json(folder / PROGRESS, content)
 
 
 @contextlib.contextmanager
@@ -252,81 +205,16 @@ def _reason(error: Exception) -> str:
     code = re.search(r"os_error_code='(\d+)'", str(error))
     if code:
         return os.strerror(int(code[1]))
-    return getattr(error, "strerror", None) or str(error).splitlines()[0]
+    said = str(error).splitlines() or [type(error).__name__]
+    return getattr(error, "strerror", None) or said[0]
 
 
 def _beneath(prefix: str, parts: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {k.removeprefix(prefix): v for k, v in parts.items() if k.startswith(prefix)}
 
 
-def _items(state: State) -> dict[str, Any]:
-    learner = state.learner
-    return {
-        "results": Results(state.archive, learner.visits, learner.random_visits),
-        "rest": state._replace(
-            archive=None,  # type: ignore[arg-type]
-            learner=learner._replace(visits=None, random_visits=None),  # type: ignore[arg-type]
-        ),
-    }
-
-
-def _stored(state: State) -> State:
-    """What Orbax stores: it accepts neither arrays without elements nor typed keys."""
-
-    def of_leaf(x: Any) -> Any:
-        if math.prod(x.shape) == 0:
-            return None
-        return jax.random.key_data(x) if _is_key(x) else x
-
-    return jax.tree.map(of_leaf, state)
-
-
-def _as_computed(stored: State, shapes: State, placed: State | None) -> State:
-    """Rebuilds the state from what `_stored` gave."""
-    leaves, tree = jax.tree.flatten(shapes)
-    shardings = [None] * len(leaves) if placed is None else jax.tree.leaves(placed)
-    kept = iter(jax.tree.leaves(stored))
-
-    def of_leaf(shape: Any, sharding: Any) -> Any:
-        if math.prod(shape.shape) == 0:
-            return jnp.empty(shape.shape, shape.dtype, device=sharding)
-        found = next(kept)
-        return jax.random.wrap_key_data(found, impl=_key_impl(shape)) if _is_key(shape) else found
-
-    return jax.tree.unflatten(tree, map(of_leaf, leaves, shardings))
-
-
-def _is_key(x: Any) -> bool:
-    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-
-
-def _key_impl(shape: Any) -> Any:
-    return jax.random.key_impl(jnp.empty((), shape.dtype))
-
-
 def _shapes(config: Config) -> State:
     return jax.eval_shape(lambda: algorithm.start(config))
-
-
-def _abstract(shapes: State, placed: State | None = None) -> State:
-    """What Orbax must load, and on which devices."""
-    if placed is None:
-        device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-        placed = jax.tree.map(lambda _: device, shapes)
-    # `_stored` for shapes: its own functions compute, and a shape has no values.
-    data = jax.eval_shape(
-        lambda state: jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, state),
-        shapes,
-    )
-    return jax.tree.map(
-        lambda x, sharding: (
-            None
-            if math.prod(x.shape) == 0
-            else jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding)
-        ),
-        data,
-        placed,
-    )
 
 
 def _load(run_directory: Path, name: str, abstract: dict[str, Any]) -> dict[str, Any]:

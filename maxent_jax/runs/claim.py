@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from maxent_jax.config import Config
 from maxent_jax.errors import UsageError
-from maxent_jax.runs import files, integrity, locks
+from maxent_jax.runs import atomic, files, integrity, locks
 from maxent_jax.runs.loggers import FOLDERS as LOGGERS
 
 
@@ -33,7 +33,7 @@ class Claim(NamedTuple):
         directory = self.directory
         try:
             _check_writable(directory)
-            if not directory.exists() or (directory.is_dir() and _is_nobodys(directory)):
+            if not directory.exists() or (directory.is_dir() and _is_free(directory)):
                 return
         except OSError as error:
             raise UsageError(f"cannot write to {directory}: {error.strerror}.") from None
@@ -82,14 +82,14 @@ def _check_writable(directory: Path) -> None:
         raise UsageError(f"cannot write to {directory}: {place} is not writable.")
 
 
-def _is_nobodys(directory: Path) -> bool:
+def _is_free(directory: Path) -> bool:
     """Whether it holds only what a run leaves that ended before its first checkpoint."""
     if integrity.checkpoints(directory):
         return False
-    return all(_is_of_a_beginning(path) for path in directory.iterdir())
+    return all(_precedes_checkpoints(path) for path in directory.iterdir())
 
 
-def _is_of_a_beginning(path: Path) -> bool:
+def _precedes_checkpoints(path: Path) -> bool:
     directory = path.parent
     if path.name == files.CONFIG and path.is_file():
         return files.is_config(path)
@@ -100,17 +100,18 @@ def _is_of_a_beginning(path: Path) -> bool:
             inside.name.startswith(integrity.UNFINISHED) for inside in path.iterdir()
         )
         return unfinished and not path.is_symlink()
-    temporary = {
-        files.temporary_of(directory / name).name for name in (files.CONFIG, files.METRICS)
-    }
     if path.name in (*LOGGERS, files.FIRST):
         return (directory / files.CONFIG).is_file()
-    return path.name in {locks.LOCK, *temporary}
+    return path.name == locks.LOCK or atomic.final_of(path.name) in (files.CONFIG, files.METRICS)
 
 
 def _remove_run(directory: Path) -> None:
-    """Removes all that a run writes, and nothing else."""
-    for path in [path for path in directory.iterdir() if files.is_written(path.name)]:
+    """Removes all that a run writes, and nothing else.
+
+    The config goes last: without it, a removal that was interrupted could not be repeated.
+    """
+    written = [path for path in directory.iterdir() if files.is_written(path.name)]
+    for path in sorted(written, key=lambda path: path.name == files.CONFIG):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)
         else:

@@ -1,7 +1,6 @@
 """Runs the three programs of an iteration one by one, and logs and saves in between."""
 
 import os
-import shutil
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,7 +12,16 @@ from maxent_jax import algorithm, components, native
 from maxent_jax.algorithm import Programs, State, devices, finetune, methods
 from maxent_jax.config import Config
 from maxent_jax.errors import UsageError
-from maxent_jax.runs import checkpoint, files, hosts, integrity, memory, runtime, source
+from maxent_jax.runs import (
+    atomic,
+    checkpoint,
+    files,
+    hosts,
+    integrity,
+    memory,
+    runtime,
+    source,
+)
 from maxent_jax.runs.checkpoint import Progress
 from maxent_jax.runs.clock import Clock
 from maxent_jax.runs.loggers import Sinks
@@ -130,7 +138,7 @@ def _from_source(config: Config, directory: Path, placed: State | None) -> State
     archive, name = source.load(config)
     state, first = finetune.start(config, archive)
     found = {"source": config.downstream.source, "checkpoint": name} | first._asdict()
-    hosts.first_alone(lambda: files.write_json(directory / files.FIRST, found), "first episodes")
+    hosts.first_alone(lambda: atomic.write_json(directory / files.FIRST, found), "first episodes")
     return state if placed is None else jax.device_put(state, placed)
 
 
@@ -149,7 +157,7 @@ def _last_progress(directory: Path, options: Options) -> Progress | None:
 
     def go_back_to_it() -> None:
         for damaged, sentence in passed_over.items():
-            shutil.rmtree(directory / integrity.FOLDER / damaged)
+            integrity.remove(directory, damaged)
             say(f"note: {sentence[:-1]}; it is removed, the run continues from checkpoint {name}.")
         for what, now in (files.stack() | _machine()).items():
             if computed_with.get(what) != now:

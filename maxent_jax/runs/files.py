@@ -1,21 +1,18 @@
-"""Reads and writes the config and metrics in a run's directory. Loads no array library."""
+"""The files of a run's directory: its config and its metrics. Loads no array library."""
 
-import contextlib
-import csv
 import dataclasses
 import importlib.metadata
 import json
-import math
 import os
 import platform
 import re
 import uuid
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from maxent_jax.config import DEFAULTS, Config, from_flat, imports
-from maxent_jax.errors import ConfigError, RunError, SaveError
+from maxent_jax.errors import ConfigError, RunError
+from maxent_jax.runs import atomic
 
 SCHEMA = 7  # of the directory, including its checkpoints
 READABLE = (4, 5, 6, 7)  # schemas with the same arrays for policies and visits
@@ -62,7 +59,7 @@ def write_config(
         "versions": stack(),
         "machine": machine,
     }
-    write_json(directory / CONFIG, content)
+    atomic.write_json(directory / CONFIG, content)
 
 
 def read_config(directory: Path) -> Config:
@@ -85,7 +82,7 @@ def read_config(directory: Path) -> Config:
         )
     try:
         return from_flat(_ungrouped(settings))
-    except (TypeError, ConfigError) as error:
+    except (TypeError, AttributeError, ConfigError) as error:
         raise RunError(f"{path} does not match this release: {error}") from None
 
 
@@ -102,8 +99,15 @@ def evaluation(directory: Path, seed_index: int = 0) -> Path:
     return directory / (f"evaluation_seed_{seed_index}.json" if seed_index else EVALUATION)
 
 
+def beside(directory: Path, ending: str) -> Path:
+    """Returns the path of a sibling of a run's directory, named after it: runs/ant-ENDING."""
+    named = directory if directory.name not in ("", "..") else Path(os.path.abspath(directory))
+    return named.with_name(f"{named.name}-{ending}")
+
+
 def is_written(name: str) -> bool:
     """Whether a command writes a file or folder of this name into a run's directory."""
+    name = atomic.final_of(name) or name
     return name in WRITTEN or re.fullmatch(r"evaluation_seed_\d+\.json", name) is not None
 
 
@@ -170,7 +174,7 @@ def append_metrics(directory: Path, row: dict[str, Any]) -> None:
       SaveError: the line cannot be written; readers skip an unfinished line.
     """
     path = directory / METRICS
-    with writing(path), open(path, "a", encoding="utf-8") as file:
+    with atomic.writing(path), open(path, "a", encoding="utf-8") as file:
         file.write(_lines([row]))
         file.flush()
         os.fsync(file.fileno())
@@ -180,14 +184,20 @@ def read_metrics(directory: Path) -> list[dict[str, Any]]:
     """Reads the rows of metrics.jsonl; skips an unfinished last line.
 
     Raises:
-      RunError: a line is not JSON.
+      RunError: a line is not a JSON object.
     """
     path = directory / METRICS
-    lines = path.read_text(encoding="utf-8").split("\n")[:-1] if path.exists() else []
-    try:
-        return [json.loads(line) for line in lines]
-    except ValueError:
-        raise RunError(f"{path} holds a line that is not JSON.") from None
+    lines = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            rows.append(dict(json.loads(line)))
+        except (ValueError, TypeError):
+            raise RunError(
+                f"line {number} of {path} is not a JSON object: the command train --resume writes "
+                f"the file again, from the last checkpoint."
+            ) from None
+    return rows
 
 
 def of_seed(row: dict[str, Any], index: int) -> dict[str, Any]:
@@ -199,41 +209,12 @@ def write_metrics(directory: Path, rows: list[dict[str, Any]]) -> None:
     """Writes metrics.jsonl with exactly these rows, unless it has them already."""
     path, text = directory / METRICS, _lines(rows)
     if not path.exists() or path.read_text(encoding="utf-8") != text:
-        _replace(path, text)
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Writes a JSON file atomically; numbers that are not finite become null."""
-    _replace(path, json.dumps(jsonable(content), indent=2) + "\n")
-
-
-def write_csv(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
-    """Writes a CSV file with these columns, completely or not at all."""
-    with (
-        whole_file(path) as temporary,
-        open(temporary, "w", encoding="utf-8", newline="") as file,
-    ):
-        writer = csv.DictWriter(file, columns, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
+        atomic.write(path, text)
 
 
 def as_name(text: str) -> str:
     """Returns a text as a part of a file name: goal:15,0 is goal_15_0."""
     return re.sub(r"[^\w.-]", "_", text)
-
-
-def jsonable(value: Any) -> Any:
-    """Returns the value in JSON's types; numbers that are not finite become null."""
-    if isinstance(value, dict):
-        return {key: jsonable(item) for key, item in value.items()}
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, list | tuple):
-        return [jsonable(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def check_writable(directory: Path) -> None:
@@ -246,47 +227,5 @@ def check_writable(directory: Path) -> None:
         raise RunError(f"{directory} is not writable: make it writable, or copy it elsewhere.")
 
 
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Context manager: turns a full disk or a missing permission into one sentence.
-
-    Raises:
-      SaveError: an OSError occurred inside.
-    """
-    try:
-        yield
-    except OSError as error:
-        raise SaveError(
-            f"cannot write {path}: {error.strerror or error}; what was saved before is intact."
-        ) from error
-
-
-@contextlib.contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """Context manager: gives a temporary file, which replaces `path` if nothing fails.
-
-    Raises:
-      SaveError: the file cannot be written.
-    """
-    temporary = temporary_of(path)
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            yield temporary
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
-
-
-def temporary_of(path: Path) -> Path:
-    """Returns the temporary file that `whole_file` gives for this path."""
-    return path.with_suffix(f".tmp{path.suffix}")
-
-
 def _lines(rows: list[dict[str, Any]]) -> str:
-    return "".join(json.dumps(jsonable(row)) + "\n" for row in rows)
-
-
-def _replace(path: Path, text: str) -> None:
-    with whole_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    return "".join(json.dumps(atomic.jsonable(row)) + "\n" for row in rows)

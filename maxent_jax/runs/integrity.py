@@ -33,8 +33,17 @@ def complete_iterations(run_directory: Path) -> int:
     return max((int(name.split("+")[0]) for name in checkpoints(run_directory)), default=0)
 
 
+def remove(run_directory: Path, name: str) -> None:
+    """Removes a checkpoint; no reader, and no later process, finds a part of it."""
+    folder = run_directory / FOLDER
+    doomed = folder / f"{UNFINISHED}{name}-removed"
+    shutil.rmtree(doomed, ignore_errors=True)
+    (folder / name).rename(doomed)
+    shutil.rmtree(doomed)
+
+
 def clear_unfinished(run_directory: Path) -> None:
-    """Removes the unfinished checkpoint of a killed process."""
+    """Removes what a killed process did not finish writing, or removing."""
     for path in (run_directory / FOLDER).glob(f"{UNFINISHED}*"):
         shutil.rmtree(path)
 
@@ -128,8 +137,16 @@ def _damages(folder: Path, unread: tuple[str, ...]) -> Iterator[str]:
             yield f"{name} is missing"
         elif path.is_symlink() or not path.is_file():
             yield f"{name} is not a plain file"
-        elif not name.startswith(unread) and checksum(path) != written:
+        elif not name.startswith(unread) and not _holds(path, written):
             yield f"{name} is not what was written"
+
+
+def _holds(path: Path, written: str) -> bool:
+    """Whether the file has this checksum; it may have been removed meanwhile."""
+    try:
+        return checksum(path) == written
+    except FileNotFoundError:
+        return False
 
 
 def _names(folder: Path) -> Iterator[str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import filelock
 
 from maxent_jax.errors import UsageError
-from maxent_jax.runs import files
+from maxent_jax.runs import atomic
 
 LOCK = "lock"
 
@@ -31,7 +31,9 @@ def holding(directory: Path, wait: bool = True) -> Iterator[None]:
         directory.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except filelock.Timeout:
-        raise BusyError(f"another process is training in {directory}: wait for its end.") from None
+        raise BusyError(
+            f"another process writes in {directory}: wait until it ends, or choose another --out."
+        ) from None
     except OSError as error:
         raise UsageError(f"cannot write to {directory}: {error.strerror}.") from None
     try:
@@ -42,5 +44,5 @@ def holding(directory: Path, wait: bool = True) -> Iterator[None]:
 
 def is_free(directory: Path, first: str) -> bool:
     """Whether a directory holds only its lock and an unfinished `first`, the first file written."""
-    begun = (LOCK, files.temporary_of(directory / first).name)
-    return all(path.name in begun for path in directory.iterdir())
+    names = [path.name for path in directory.iterdir()]
+    return all(name == LOCK or atomic.final_of(name) == first for name in names)

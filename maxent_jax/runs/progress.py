@@ -203,9 +203,14 @@ def _reached(row: dict[str, Any]) -> list[str]:
     if not row:
         return []
     if "task_return" in row:
-        reached = [f"return {np.mean(row['task_return']):,.1f}"]
+        reached = [f"return {_mean(row['task_return']):,.1f}"]
         if "task_success" in row:
-            reached.append(f"{np.mean(row['task_success']):.0%} successes")
+            reached.append(f"{_mean(row['task_success']):.0%} successes")
         return reached
-    coverage = np.mean(row["cumulative_coverage"])
-    return [f"{coverage:,.0f} cells", f"{np.mean(row['cumulative_entropy']):.2f} nats"]
+    coverage, entropy = _mean(row["cumulative_coverage"]), _mean(row["cumulative_entropy"])
+    return [f"{coverage:,.0f} cells", f"{entropy:.2f} nats"]
+
+
+def _mean(of_seeds: Any) -> float:
+    """NaN if a number was not finite: a user's task may reward a state with NaN."""
+    return float(np.mean(np.array(of_seeds, float)))

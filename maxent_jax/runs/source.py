@@ -95,14 +95,14 @@ def load(config: Config) -> "tuple[Archive, str]":
     remedy = (
         "the command train --resume --fallback on that run removes it, and repeats what it held"
     )
-    name, _ = integrity.find(directory, whole=False, remedy=remedy)
-    archive = checkpoint.restore_results(directory, name, of_source).archive
+    latest = checkpoint.restore_latest(directory, of_source, remedy)
+    archive = latest.results.archive
     if of_source.num_seeds > 1:
         archive = jax.tree.map(lambda x: x[config.downstream.source_seed], archive)
     if iterations := config.downstream.source_iterations:
         policies = 1 + iterations * of_source.mixture.snapshots
         archive = archive._replace(size=jax.numpy.minimum(archive.size, policies))
-    return archive, name
+    return archive, latest.name
 
 
 def on_task(

@@ -11,7 +11,7 @@ from maxent_jax import algorithm, errors
 from maxent_jax.algorithm import Programs, State
 from maxent_jax.algorithm.convergence import has_plateaued
 from maxent_jax.config import Config
-from maxent_jax.runs import files, integrity
+from maxent_jax.runs import atomic, integrity
 from maxent_jax.runs.checkpoint import Progress
 from maxent_jax.runs.clock import Clock
 from maxent_jax.runs.progress import Bar
@@ -41,7 +41,7 @@ def advance(
         bar.segment_done()
         return Stage(state, progress._replace(segments=[*progress.segments, metrics]))
     state, at_end = clock.time("wall_end", programs.end, state)
-    row = files.jsonable(_row(config, progress, at_end) | clock.end_iteration())
+    row = atomic.jsonable(_row(config, progress, at_end) | clock.end_iteration())
     bar.iteration_done(row)
     return Stage(state, progress._replace(rows=[*progress.rows, row], begun=None, segments=[]))
 
@@ -91,11 +91,14 @@ def check_finite(directory: Path, state: State, progress: Progress) -> None:
     if wrong:
         where = jax.tree_util.keystr(wrong[0], simple=True, separator=".")
         iteration = len(progress.rows) + (progress.begun is not None)
+        when = f"in segment {len(progress.segments)}" if progress.segments else "at its beginning"
+        if progress.begun is None:
+            when = "at its end"
+        saved = integrity.checkpoints(directory)
         raise errors.NonFiniteError(
-            f"iteration {iteration} produced a number that is not finite after "
-            f"{len(progress.segments)} of its segments (first in {where}): this is not saved, and "
-            f"{directory} holds the run up to checkpoint "
-            f"{(integrity.checkpoints(directory) or ['none'])[-1]}."
+            f"iteration {iteration} produced a number that is not finite {when} (first in "
+            f"{where}): this is not saved, and {directory} holds "
+            f"{f'the run up to checkpoint {saved[-1]}' if saved else 'no checkpoint yet'}."
         )
 
 

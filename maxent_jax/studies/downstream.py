@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from maxent_jax.runs import files
-from maxent_jax.studies import protocol, statistics
+from maxent_jax.studies import disk, statistics
 from maxent_jax.studies.protocol import SCRATCH, Cell
 from maxent_jax.studies.statistics import Scores
 
@@ -53,7 +53,7 @@ def read(directory: Path, cells: Sequence[Cell]) -> list[Row]:
         scale = known.get(env, {}).get(task)
         head: Row = {"env": env, "task": task, "method": cell.method, "seed": cell.config.seed}
         head["explored_steps"] = _explored_steps(cell)
-        for row in files.read_metrics(protocol.home(directory, cell)):
+        for row in files.read_metrics(disk.home(directory, cell)):
             own = head | {name: row[name] for name in COLUMNS if name in row}
             if scale:
                 own["score"] = (row["task_return"] - scale.untrained) / (

@@ -11,7 +11,7 @@ import numpy as np
 from maxent_jax import mixture
 from maxent_jax.baselines import hazan
 from maxent_jax.errors import UsageError
-from maxent_jax.runs import files
+from maxent_jax.runs import atomic, files
 from maxent_jax.studies import protocol, statistics
 from maxent_jax.studies.values import RANDOM
 
@@ -45,8 +45,8 @@ def results(directory: Path, scale: str, num_seeds: int | None) -> Results:
     asked, settings = _asked(scale, num_seeds)
     found = {env: _run(settings[env], asked["seeds"]) for env in settings}
     content = asked | {"versions": files.stack(), "results": found}
-    files.write_json(directory / RESULTS, content)
-    return files.jsonable(found)
+    atomic.write_json(directory / RESULTS, content)
+    return atomic.jsonable(found)
 
 
 def held(directory: Path, scale: str, num_seeds: int | None) -> Results | None:
@@ -61,7 +61,7 @@ def held(directory: Path, scale: str, num_seeds: int | None) -> Results | None:
     content = _read(path)
     asked, settings = _asked(scale, num_seeds)
     used = {env: of_env.get("settings") for env, of_env in content.get("results", {}).items()}
-    wanted = files.jsonable({env: s._asdict() for env, s in settings.items()})
+    wanted = atomic.jsonable({env: s._asdict() for env, s in settings.items()})
     if {name: content.get(name) for name in asked} | used != asked | wanted:
         raise UsageError(
             f"{path} was made at another scale, or with other seeds or settings: choose another "

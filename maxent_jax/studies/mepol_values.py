@@ -4,9 +4,7 @@ It takes as many gradient steps as its trust region allows, far fewer than SAC, 
 batch of episodes.
 """
 
-import contextlib
 import dataclasses
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -17,8 +15,7 @@ from maxent_jax import components
 from maxent_jax.baselines import mepol
 from maxent_jax.baselines.mepol import Settings
 from maxent_jax.config import Config
-from maxent_jax.runs import files
-from maxent_jax.studies import values
+from maxent_jax.studies import kept, values
 from maxent_jax.studies.values import COLUMNS, Row
 
 METHOD, RESULTS = "MEPOL", "mepol.json"
@@ -26,18 +23,13 @@ METHOD, RESULTS = "MEPOL", "mepol.json"
 
 def rows(directory: Path, config: Config, num_seeds: int) -> list[Row]:
     """Returns a row per seed and iteration: computes them once, then reads the directory's file."""
-    path = directory / RESULTS
-    asked = files.jsonable(
-        {"config": config.flat(), "seeds": num_seeds}
-        | {"settings": dataclasses.asdict(settings_of(config))}
-    )
-    with contextlib.suppress(OSError, ValueError, AttributeError):  # no file yet, or a damaged one
-        held = json.loads(path.read_text(encoding="utf-8"))
-        if {name: held.get(name) for name in asked} == asked:
-            return [values.known(row) for row in held["rows"]]
-    found = _train(config, num_seeds)
-    files.write_json(path, asked | {"versions": files.stack(), "rows": found})
-    return found
+    asked = {
+        "config": config.flat(),
+        "seeds": num_seeds,
+        "settings": dataclasses.asdict(settings_of(config)),
+    }
+    train = lambda: {"rows": _train(config, num_seeds)}
+    return [values.known(row) for row in kept.once(directory / RESULTS, asked, train)["rows"]]
 
 
 def settings_of(config: Config) -> Settings:
@@ -63,7 +55,7 @@ def _train(config: Config, num_seeds: int) -> list[dict[str, Any]]:
         found += [
             {"env": config.env, "method": METHOD, "seed": config.seed + i}
             | {"iteration": iteration, "wall_seconds": seconds}
-            | {name: values[i] for name, values in measured.items()}
+            | {name: of_seeds[i] for name, of_seeds in measured.items()}
             for i in range(num_seeds)
         ]
     return found

@@ -4,9 +4,7 @@ Each dataset has equally many transitions, from fresh episodes of a finished run
 by the task afterwards. The untrained policy of the first method's runs makes one more.
 """
 
-import contextlib
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +18,7 @@ from maxent_jax.analysis import dataset, load_run
 from maxent_jax.baselines import td3_bc
 from maxent_jax.baselines.td3_bc import Settings
 from maxent_jax.runs import files, progress
-from maxent_jax.studies import protocol, statistics
+from maxent_jax.studies import disk, kept, statistics
 from maxent_jax.studies.protocol import Cell
 
 UNTRAINED = "untrained policy"
@@ -60,27 +58,25 @@ def _row(directory: Path, scale: str, cell: Cell, data: str, task: str) -> Row:
     settings = Settings(num_updates=UPDATES[scale])
     row: Row = {"env": cell.config.env, "task": task, "data": data, "seed": cell.config.seed}
     row["transitions"] = num
-    at = protocol.home(directory, cell)
+    at = disk.home(directory, cell)
     asked = row | {"settings": dataclasses.asdict(settings), "run": files.read_id(at)}
     name = "-".join([cell.name, *(["untrained"] if data == UNTRAINED else []), task])
     path = directory / FOLDER / f"{files.as_name(name)}.json"
-    with contextlib.suppress(OSError, ValueError, AttributeError):  # none yet, or a damaged one
-        held = json.loads(path.read_text(encoding="utf-8"))
-        if {key: held.get(key) for key in asked} == asked:
-            return {key: held[key] for key in COLUMNS}
-    run = load_run(at)
-    p = components.with_task(run.components, task)
-    weights = jnp.asarray(run.weights)
-    if data == UNTRAINED:
-        weights = jnp.zeros_like(weights).at[0].set(1.0)
-    key_data, key_train, key_play = jax.random.split(jax.random.key(cell.config.seed), 3)
-    collected = dataset.collect(p, run.mixture, weights, num, key_data)
-    policy = td3_bc.train(p, settings, collected, key_train)
-    returns = td3_bc.evaluate(p, settings, policy, num_episodes, key_play)
-    row["data_reward"] = float(np.mean(collected["rewards"]))
-    row["task_return"] = float(np.mean(returns))
-    files.write_json(path, asked | row | {"versions": files.stack()})
-    return row
+
+    def learn() -> Row:
+        run = load_run(at)
+        p = components.with_task(run.components, task)
+        weights = jnp.asarray(run.weights)
+        if data == UNTRAINED:
+            weights = jnp.zeros_like(weights).at[0].set(1.0)
+        key_data, key_train, key_play = jax.random.split(jax.random.key(cell.config.seed), 3)
+        collected = dataset.collect(p, run.mixture, weights, num, key_data)
+        policy = td3_bc.train(p, settings, collected, key_train)
+        returns = td3_bc.evaluate(p, settings, policy, num_episodes, key_play)
+        return {"data_reward": np.mean(collected["rewards"]), "task_return": np.mean(returns)}
+
+    found = kept.once(path, asked, learn)
+    return row | {name: found[name] for name in ("data_reward", "task_return")}
 
 
 def summarise(found: Sequence[Row]) -> dict[str, dict[str, dict[str, Any]]]:

@@ -63,8 +63,8 @@ def classic_weights(found: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]])
     """
     titles = {
         "running_entropy": "as published: running mean",
-        "density_entropy": "the mixture's ten runs, one start",
-        "fresh_entropy": "a hundred runs from rest",
+        "density_entropy": "runs of the mixture, one start",
+        "fresh_entropy": "fresh runs of the mixture, from rest",
     }
     colors = ("#d1495b", "#1b6ca8", "#5fa8d3", "#9a7aa0", COLORS[RANDOM])
     figure = Figure(figsize=(13, 3.4 * len(found)), layout="constrained")
@@ -77,9 +77,8 @@ def classic_weights(found: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]])
             ax.grid(alpha=0.25)
         row[0].set_ylabel("entropy (nats)")
     axes[0, 0].legend(frameon=False, fontsize=8)
-    figure.suptitle(
-        f"MaxEnt-H as published: interquartile mean of {len(values)} seeds, 95 % interval"
-    )
+    seeds = len(next(iter(next(iter(found.values()))["running_entropy"].values())))
+    figure.suptitle(f"MaxEnt-H as published: interquartile mean of {seeds} seeds, 95 % interval")
     return figure
 
 

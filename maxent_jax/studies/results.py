@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 from maxent_jax import mixture
 from maxent_jax.algorithm import methods
 from maxent_jax.config import Config
-from maxent_jax.runs import files, locks
+from maxent_jax.runs import atomic, files, locks
 from maxent_jax.studies import (
+    disk,
     downstream,
     hazan_weights,
     mepol_values,
@@ -75,7 +76,7 @@ def fig2(directory: Path) -> None:
         | {f"η = {eta}": mixture.geometric_weights(time, eta) for eta in protocol.ETAS}
         for time in FIG2_TIMES
     }
-    files.write_json(directory / "weights.json", weights)
+    atomic.write_json(directory / "weights.json", weights)
     _save(paper_figures.weights(weights), directory, "fig2")
     print(f"{directory / 'weights.json'}")
 
@@ -84,7 +85,7 @@ def fig3(directory: Path, scale: str, num_seeds: int | None) -> None:
     """Draws Fig. 3: weights in the classic environments with the official settings."""
     found = hazan_weights.results(directory, scale, num_seeds)
     table = hazan_weights.table(found)
-    files.write_json(directory / "summary.json", dict(table))
+    atomic.write_json(directory / "summary.json", dict(table))
     _save(paper_figures.classic_weights(hazan_weights.curves(found)), directory, "fig3")
     _print("uniform", table)
     print(f"{directory / hazan_weights.RESULTS}, {directory / 'summary.json'}")
@@ -97,7 +98,7 @@ def study(directory: Path, name: str, cells: Sequence[Cell]) -> None:
         ours = [cell for cell in cells if cell.method == cells[0].method]
         for config in (cell.config for cell in ours):
             rows += mepol_values.rows(directory / config.env, config, config.num_seeds)
-    files.write_csv(directory / "raw.csv", values.COLUMNS, rows)
+    atomic.write_csv(directory / "raw.csv", values.COLUMNS, rows)
     groups = list(values.groups(rows))
     summary: dict[str, Any] = {
         "study": name,
@@ -105,7 +106,7 @@ def study(directory: Path, name: str, cells: Sequence[Cell]) -> None:
         "versions": _versions(directory, cells),
         **summarise(groups),
     }
-    files.write_json(directory / "summary.json", summary)
+    atomic.write_json(directory / "summary.json", summary)
     rivals = cells[0].config.protocol == "metra"
     quantities = paper_figures.UNIT_CELLS if rivals else paper_figures.QUANTITIES
     _save(paper_figures.curves(groups, _what(name), quantities), directory, name)
@@ -123,11 +124,11 @@ def study(directory: Path, name: str, cells: Sequence[Cell]) -> None:
 def on_tasks(directory: Path, name: str, cells: Sequence[Cell]) -> None:
     """Writes raw.csv, summary.json and the figure of a study of tasks, and prints its table."""
     rows = downstream.read(directory, cells)
-    files.write_csv(directory / "raw.csv", downstream.COLUMNS, rows)
+    atomic.write_csv(directory / "raw.csv", downstream.COLUMNS, rows)
     groups = list(downstream.summarise(rows))
     versions = _versions(directory, cells)
     summary = {"study": name, "what": _what(name), "versions": versions, "scores": groups}
-    files.write_json(directory / "summary.json", summary)
+    atomic.write_json(directory / "summary.json", summary)
     without = dict.fromkeys(f"{row['task']} ({row['env']})" for row in rows if "score" not in row)
     if without:
         print(f"note: without a score, as experts.json has no expert: {', '.join(without)}.")
@@ -153,11 +154,11 @@ def on_tasks(directory: Path, name: str, cells: Sequence[Cell]) -> None:
 def from_data(directory: Path, name: str, scale: str, cells: Sequence[Cell]) -> None:
     """Learns from the data of each cell; writes raw.csv, summary.json and the figure."""
     rows = offline.rows(directory, scale, cells, protocol.STUDIES[name].relabelled)
-    files.write_csv(directory / "raw.csv", offline.COLUMNS, rows)
+    atomic.write_csv(directory / "raw.csv", offline.COLUMNS, rows)
     tables = offline.summarise(rows)
     versions = _versions(directory, cells)
     summary = {"study": name, "what": _what(name), "versions": versions, "returns": tables}
-    files.write_json(directory / "summary.json", summary)
+    atomic.write_json(directory / "summary.json", summary)
     _save(paper_figures.returns(tables, _what(name)), directory, name)
     _print("V", tables)
     print(f"{directory / 'raw.csv'}, {directory / 'summary.json'}")
@@ -167,7 +168,7 @@ def fig5(directory: Path, trained: Path, cells: Sequence[Cell]) -> None:
     """Draws Fig. 5: the occupancy of each method's first seed, in training and of the mixture."""
     for env in dict.fromkeys(cell.config.env for cell in cells):
         chosen = [c for c in cells if c.config.env == env and c.config.seed == 0]
-        figure = paper_figures.occupancies({c.method: protocol.home(trained, c) for c in chosen})
+        figure = paper_figures.occupancies({c.method: disk.home(trained, c) for c in chosen})
         _save(figure, directory, f"fig5_{env}")
 
 
@@ -209,7 +210,7 @@ def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[
     }
     return {
         "compared_with": ours,
-        "seeds": len(groups[0][2]["env_steps"]),
+        "seeds": {env: len(columns["env_steps"]) for env, _, columns in groups},
         "last_iteration": {
             env: {name: statistics.compare(by_method, ours) for name, by_method in of_env.items()}
             for env, of_env in last.items()
@@ -220,7 +221,7 @@ def summarise(groups: Sequence[tuple[str, str, dict[str, np.ndarray]]]) -> dict[
 
 def _versions(directory: Path, cells: Sequence[Cell]) -> list[dict[str, str]]:
     """The different sets of versions that made the runs."""
-    of_cells = [files.read_versions(protocol.home(directory, cell)) for cell in cells]
+    of_cells = [files.read_versions(disk.home(directory, cell)) for cell in cells]
     return [v for i, v in enumerate(of_cells) if v not in of_cells[:i]]
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from maxent_jax.runs import files
-from maxent_jax.studies import protocol
+from maxent_jax.studies import disk
 from maxent_jax.studies.protocol import Cell
 
 MEASURED = ("coverage", "entropy", "off_grid_share")
@@ -29,7 +29,7 @@ def read(directory: Path, cells: Sequence[Cell]) -> list[Row]:
     found = []
     first = cells[0].method
     for cell in cells:
-        for row in files.read_metrics(protocol.home(directory, cell)):
+        for row in files.read_metrics(disk.home(directory, cell)):
             for index in range(cell.config.num_seeds):
                 seed = cell.config.seed + index
                 head: Row = {"env": cell.config.env, "method": cell.method, "seed": seed}

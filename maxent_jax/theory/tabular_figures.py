@@ -84,7 +84,7 @@ def refresh(results: Mapping[str, Any]) -> Figure:
             ax.plot(found["periods"], middle, style, color=color, ms=4, label=labels[series])
             ax.fill_between(found["periods"], gap.min(1), gap.max(1), color=color, alpha=0.12, lw=0)
         ax.set_title(name, fontsize=10)
-        ax.set(xlabel="planning steps between refreshes", xscale="log", yscale="log")
+        ax.set(xlabel="planning steps between refreshes", yscale="log")
         ax.set_xscale("log", base=2)
         ax.grid(alpha=0.25)
     budget = next(iter(results["refresh"].values()))["budget"]
@@ -103,7 +103,8 @@ def cases(results: Mapping[str, Any]) -> Figure:
     times = np.array(found["methods"]["V"]["times"])
     cost = found["first_policy_costs"]
     ax.plot(times, cost / (times + 1), "k:", lw=1.2, label="cost of π₀ / (T + 1)")
-    ax.set(title="river swim of 20, γ = 0.9: V loses", xlabel="iterations", ylim=(SMALLEST, None))
+    ax.set(title=f"river swim of {found['length']}, γ = 0.9: V loses", xlabel="iterations")
+    ax.set_ylim(SMALLEST, None)
     ax.set_ylabel("gap of the smoothed entropy (nats)")
     ax.legend(frameon=False, fontsize=7.5)
 

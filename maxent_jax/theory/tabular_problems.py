@@ -1,5 +1,6 @@
 """The MDPs of the command `theory`, their optima and bounds, and runs compared with these."""
 
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -120,10 +121,15 @@ def read(path: Path, discount: float) -> Mdp:
       UsageError: the file cannot be read, or holds no MDP.
     """
     try:
-        with np.load(path) as file:
+        with path.open("rb") as opened, np.load(opened) as file:
             return mdps.discounted(Dynamics(file["transitions"], file["start"]), discount)
     except OSError as mistake:
-        raise UsageError(f"--mdp {path} cannot be read: {mistake.strerror}.") from None
+        raise UsageError(f"--mdp {path} cannot be read: {mistake.strerror or mistake}.") from None
+    except (EOFError, TypeError, zipfile.BadZipFile):  # TypeError: an .npy file
+        raise UsageError(
+            f"--mdp {path} is not an .npz file: save it with numpy.savez(path, transitions=..., "
+            f"start=...)."
+        ) from None
     except (KeyError, ValueError) as mistake:
         raise UsageError(f"--mdp {path} holds no MDP: {str(mistake).strip(chr(39))}.") from None
 

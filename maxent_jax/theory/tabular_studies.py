@@ -202,7 +202,7 @@ def lost(
         begun = jax.vmap(lambda policy: tabular.occupancy(tabular.on_device(mdp), policy))
         first = np.asarray(begun(jnp.asarray(problem.first)))
     forever = (problem.reward_at_optimum() * (problem.optimal_occupancy - first)).sum(1)
-    return {"methods": found, "first_policy_costs": forever.mean()}
+    return {"length": length, "methods": found, "first_policy_costs": forever.mean()}
 
 
 def game(problem: Problem, iterations: int, tolerance: float) -> dict[str, Any]:

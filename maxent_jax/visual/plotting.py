@@ -18,7 +18,8 @@ from maxent_jax.config import tasks
 from maxent_jax.density import histogram
 from maxent_jax.density.histogram import Grid
 from maxent_jax.mixture.occupancy import Occupancy
-from maxent_jax.runs.files import FIGURES, whole_file, writing
+from maxent_jax.runs.atomic import whole_file, writing
+from maxent_jax.runs.files import FIGURES
 
 COVERAGE_AXES = (
     ("iteration", "iteration"),
@@ -65,12 +66,10 @@ def comparison(seeds: Mapping[str, Sequence[Run]]) -> Figure:
             _draw_curves(axes, run, prefix, color=color, ls=style, marker=".", lw=1.2, ms=4)
         for run in runs:
             _draw_task(axes, run, color=color, ls="--", marker=".", lw=1.2, ms=4)
-        colors.append(Line2D([], [], color=color, lw=4, label=name))
+        colors.append(Line2D([], [], color=color, lw=4, label=_as_it_is(name)))
     _start_at_zero(axes)
     axes[1, 0].legend(handles=styles, frameon=False, fontsize=9, loc="lower right")
-    legend = figure.legend(handles=colors, frameon=False, fontsize=9, loc="outside lower center")
-    for text in legend.get_texts():
-        text.set_parse_math(False)  # a name may contain any sign
+    figure.legend(handles=colors, frameon=False, fontsize=9, loc="outside lower center")
     return figure
 
 
@@ -87,7 +86,7 @@ def _axes_of_curves(runs: Sequence[Run], coverage_label: str) -> tuple[Figure, n
             ax.set_xlabel(label)
             ax.grid(alpha=0.25)
     for ax, label in zip(axes[:, 0], labels, strict=True):
-        ax.set_ylabel(label)
+        ax.set_ylabel(_as_it_is(label))
     return figure, axes
 
 
@@ -274,12 +273,19 @@ def _name_axes(ax: Axes, run: Run) -> None:
     ax.set(xlabel=x_name, ylabel=y_name)
 
 
+def _as_it_is(text: str) -> str:
+    """The text for Matplotlib, which takes $ for the beginning of a formula; a name may have it."""
+    return text.replace("$", r"\$")
+
+
 def _finish(figure: Figure, run: Run) -> Figure:
     """Adds a title and, below, every departure from the paper by name."""
     config = run.config
     task = config.downstream.task
-    paid = "" if task == tasks.NONE else f", task {task}"
-    figure.suptitle(f"{config.title}, {config.env}{paid}, preset {config.preset}, seed {run.seed}")
+    where = config.env if task == tasks.NONE else f"{config.env}, task {task}"
+    title = f"{config.title}, {where}, preset {config.preset}, seed {run.seed}"
+    figure.suptitle(_as_it_is(title))
     named = ", ".join(f"{name}={config[name]}" for name in config.deviations())
-    figure.supxlabel(f"departs from the paper in: {named or 'nothing'}", fontsize=6, wrap=True)
+    departures = f"departs from the paper in: {named or 'nothing'}"
+    figure.supxlabel(_as_it_is(departures), fontsize=6, wrap=True)
     return figure
