@@ -3,13 +3,14 @@
 import dataclasses
 import importlib
 import os
+import pkgutil
 import re
 import shutil
 from pathlib import Path
 
 import pytest
 
-from maxent_jax.config import DEFAULTS
+from maxent_jax.config import DEFAULTS, preset
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -65,6 +66,44 @@ def flags_of(command):
     fields = [field.name for field in dataclasses.fields(command.Arguments)]
     names = {name.replace("_", "-") for name in [*fields, *DEFAULTS]} | {"import", "from"}
     return {f"--{no}{name}" for name in names for no in ("", "no-")} | {"--help", "--help-all"}
+
+
+def exists(name):
+    """Whether the package has this file, function or setting."""
+    if "/" in name or name.endswith(".py"):
+        return (ROOT / "maxent_jax" / name).exists()
+    try:
+        pkgutil.resolve_name(f"maxent_jax.{name}")
+    except (AttributeError, ModuleNotFoundError):
+        group, _, setting = name.removeprefix("config.").partition(".")
+        return setting in DEFAULTS and hasattr(getattr(preset("smoke"), group), setting)
+    return True
+
+
+def test_the_code_of_each_symbol_of_the_paper_is_there():
+    page = (ROOT / "docs" / "paper-to-code.md").read_text()
+    rows = re.findall(r"^\| (.+) \| (.+) \|$", page, re.MULTILINE)[1:]
+    assert len(rows) > 20
+    for symbol, code in rows:
+        folder = module = ""  # of the name before, which the next may leave out
+        for name in re.findall(r"`([\w./]+)`", code):
+            if name.endswith(".py"):
+                assert exists(name) or exists(folder + name), f"{symbol}: {name}"
+                folder = name.rpartition("/")[0] + "/" if "/" in name else folder
+            elif "." in name:
+                assert exists(name), f"{symbol}: {name}"
+                module = name.rpartition(".")[0]
+            elif module:
+                assert exists(f"{module}.{name}"), f"{symbol}: {name}"
+
+
+def test_the_functions_of_the_reading_order_are_there():
+    text = (ROOT / "docs" / "concepts" / "algorithm.md").read_text().split("## Reading order")[1]
+    found = re.findall(r"`([\w/]+)\.py`:((?:,?\s+(?:and )?`[\w.]+`)+)", text)
+    assert len(found) > 15
+    for path, names in found:
+        for name in re.findall(r"`([\w.]+)`", names):
+            assert exists(f"{path.replace('/', '.')}.{name}"), f"{path}.py: {name}"
 
 
 def blocks(page):

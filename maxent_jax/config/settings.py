@@ -203,7 +203,7 @@ class Downstream(_Checked):
     source_seed: int = 0
     """Which seed of that run, from 0, if it has several."""
     source_iterations: int = 0
-    """Use the policies of this many iterations of that run, the first ones; 0: of all."""
+    """Use only the policies of that run's first N iterations; 0: of all iterations."""
     restart_share: float = 0.0
     """Share of the episodes that begin at a state of the best tenth of the first episodes."""
     critic_steps: int = 0
